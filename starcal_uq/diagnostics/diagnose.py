@@ -352,7 +352,9 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     some = _few(obs)
     sigmas = cal.sigmas * np.sqrt(obs.n_stars / some.n_stars)
     reference, lowest = cal.theta, cal.chi2
-    if some is not obs or has_effects(cal):
+    # Tails beside a noise model are estimated in turns, which end a little beside this optimum.
+    robust = cal.provenance.likelihood != "marginal"
+    if some is not obs or robust or has_effects(cal):
         try:
             optimum, found = _optimum(some, cal, cal.camera)
         except StarcalError:

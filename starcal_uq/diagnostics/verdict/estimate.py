@@ -187,6 +187,8 @@ def model_checks(
 ) -> list[Check]:
     """Every check that a diagnosis allows."""
     moving = EFFECTS if _OF_FRAMES_APART & set(diagnosis.effects) else ()
+    # What tails do not describe either is no noise of these stars.
+    robust = SCREEN if cal.provenance.likelihood == "student_t" else ROBUST
     checks = [
         misfit(diagnosis.misfit, cal, attitude, diagnosis.better, diagnosis.extended),
         even_noise(diagnosis.misfit, EFFECTS if diagnosis.effects else ()),
@@ -196,7 +198,7 @@ def model_checks(
         (partial(jackknife, moving=moving), diagnosis.jackknife),
         (stars, diagnosis.stars),
         (partial(comparison, attitude=attitude), diagnosis.comparison),
-        (predictive, diagnosis.predictive),
+        (partial(predictive, remedies=robust), diagnosis.predictive),
     ]
     return [*checks, *(check(found) for check, found in asked if found is not None)]
 
@@ -395,7 +397,7 @@ def _coefficients(model: str) -> list[str]:
     return [c.name for c in get_model(model).coefficients]
 
 
-def predictive(found: PredictiveCheck) -> Check:
+def predictive(found: PredictiveCheck, remedies: Remedies = ROBUST) -> Check:
     """Do replicated data look like the measured ones?"""
     extreme = tuple(s.name for s in found.statistics if s.extreme)
     low = min(found.statistics, key=lambda s: min(s.p_value, 1.0 - s.p_value))
@@ -403,8 +405,7 @@ def predictive(found: PredictiveCheck) -> Check:
         Code.POSTERIOR_PREDICTIVE_CHECK,
         {"p_value": low.p_value, "n_draws": found.n_draws, "extreme": extreme},
         dict(zip(("p_value_least", "p_value_most"), EXTREME_P, strict=True)),
-        # What tails do not describe either is no noise of these stars.
-        (*ROBUST, *SCREEN),
+        remedies,
         good=not extreme,
     )
 
