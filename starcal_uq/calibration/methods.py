@@ -5,10 +5,10 @@ The methods that Ye & Yang 2017 compare theirs with are offered by the wing of t
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Protocol, cast
 
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.extras import entry_point
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -37,7 +37,7 @@ def offered(method: str) -> Offered:
 
     CalibrationError where no installed package offers it.
     """
-    found = next(iter(entry_points(group=GROUP, name=method)), None)
+    found = entry_point(GROUP, method)
     if found is None:
         raise CalibrationError(
             f"method {method!r} is not offered by any installed package: install starcal_uq again."

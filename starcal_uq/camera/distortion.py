@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib.metadata import entry_points
 from typing import Any, Literal
 
 from starcal_uq.camera.planes import EQUIDISTANT, PINHOLE, Plane
 from starcal_uq.core.errors import DistortionError
+from starcal_uq.core.extras import entry_point
 from starcal_uq.core.types import FloatArray, floats
 
 # Where other packages offer models.
@@ -278,7 +278,7 @@ def get_model(name: str) -> DistortionModel:
 
 def _offered(name: str) -> DistortionModel:
     """The model that another package offers; its coefficients become known by their names."""
-    found = next(iter(entry_points(group=GROUP, name=name)), None)
+    found = entry_point(GROUP, name)
     if found is None:
         raise DistortionError(
             f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}, each "

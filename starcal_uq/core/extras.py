@@ -1,12 +1,18 @@
-"""Libraries that only some users need: extras of the package, imported where they are used."""
+"""Libraries that only some users need: extras of the package, imported where they are used, and what
+other packages offer.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from starcal_uq.core.errors import MissingExtraError
 from starcal_uq.core.provenance import NAME
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 @contextmanager
@@ -24,3 +30,10 @@ def extra(name: str, what: str, instead: str = "") -> Iterator[None]:
         raise MissingExtraError(
             f'{what} need {library}: run `pip install "{NAME}[{name}]"`{otherwise}.'
         ) from None
+
+
+def entry_point(group: str, name: str) -> EntryPoint | None:
+    """The entry point of this name in a group; None where no installed package offers it."""
+    from importlib.metadata import entry_points
+
+    return next(iter(entry_points(group=group, name=name)), None)

@@ -172,7 +172,8 @@ def _noise(cal: Calibration, shape: tuple[int, ...], rng: np.random.Generator) -
     nu = float(cal.provenance.student_t["dof"])
     share = rng.beta(1.0, nu / 2.0, shape[-1])
     # Weights (nu + 2) / (nu + r^2) bound what is left.
-    square = nu * share / (1.0 - share) if cal.star_weights is None else (nu + 2.0) * share
+    weights = "tail_weights" in cal.provenance
+    square = (nu + 2.0) * share if weights else nu * share / (1.0 - share)
     return floats(noise * np.sqrt(square / np.sum(noise[0] ** 2, axis=0)))
 
 

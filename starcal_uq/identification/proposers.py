@@ -6,18 +6,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
 from os import PathLike
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.extras import entry_point
 from starcal_uq.core.files import shown
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
 from starcal_uq.sky.catalogue import StarCatalogue
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 GROUP = "starcal_uq.engines"
 
@@ -42,11 +45,11 @@ def prepare_engine(
 
     IdentificationError where no installed package offers it.
     """
-    offered = offered_engine(engine)
-    if offered is None:
+    found = offered_engine(engine)
+    if found is None:
         pairs = prepare_pairs(stars, geometry, tolerance, cache, cache_dir)
         return partial(hypotheses, pairs.ready())
-    proposer: Proposer = offered.load()(stars, geometry, tolerance)
+    proposer: Proposer = found.load()(stars, geometry, tolerance)
     return proposer
 
 
@@ -57,7 +60,7 @@ def offered_engine(name: str) -> EntryPoint | None:
     """
     if name == "pyramid":
         return None
-    found = next(iter(entry_points(group=GROUP, name=name)), None)
+    found = entry_point(GROUP, name)
     if found is None:
         raise IdentificationError(
             f"there is no engine {shown(name)}: choose pyramid, or install a package that offers it."

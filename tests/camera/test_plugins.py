@@ -124,7 +124,7 @@ def test_models_that_do_not_fit(
     model = DistortionModel("theirs", (lens,), "forward", formula or radial, "this test")
     monkeypatch.setattr(EntryPoint, "load", lambda entry: model)
     offered = EntryPoints([EntryPoint("theirs", "their.module:MODEL", distortion.GROUP)])
-    monkeypatch.setattr(distortion, "entry_points", offered.select)
+    monkeypatch.setattr("importlib.metadata.entry_points", offered.select)
     with pytest.raises(DistortionError, match=problem):
         distortion.get_model("theirs")
     assert distortion.PARAMETERS.get(lens.name) != lens

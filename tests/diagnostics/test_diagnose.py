@@ -149,7 +149,7 @@ def test_starts_are_compared_with_all_frames_where_some_have_no_optimum(obs, cal
 
 
 def test_starts_reach_the_optimum_of_noise_and_tails_together(obs):
-    """Both are estimated in turns: what a start reaches is held beside one search from there."""
+    """Both are estimated in turns, and a start in one search."""
     some = obs.select(obs.frame < 30)
     rng = np.random.default_rng(7)
     noise = rng.standard_t(6, (2, len(some))) * np.array([[0.2], [0.02]])

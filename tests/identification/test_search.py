@@ -464,7 +464,7 @@ def test_triangles_left_after_a_first_search() -> None:
 def offer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a package installed that offers the engine tetra3rs."""
     offered = EntryPoint("tetra3rs", "tests.helpers.plate_solver:PlateSolver", proposers.GROUP)
-    monkeypatch.setattr(proposers, "entry_points", EntryPoints([offered]).select)
+    monkeypatch.setattr("importlib.metadata.entry_points", EntryPoints([offered]).select)
 
 
 @pytest.mark.parametrize(("fov_deg", "focal", "shift_px"), [(20.0, 0.97, -20.0)])
