@@ -1,5 +1,5 @@
-"""All commands of the command line, each loaded when it is called, and what is said of a wrong
-call.
+"""All commands of the command line, each loaded when it is called, and the sentences about a
+wrong call.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _common(
         ),
     ] = False,
 ) -> None:
-    """What the program does without a command."""
+    """Options of the program itself."""
 
 
 app: Any = get_command(

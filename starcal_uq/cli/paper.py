@@ -5,19 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcal_uq.cli.answers import Answer
-from starcal_uq.cli.console import print_table, progress_bar, say, show_table
+from starcal_uq.cli.console import print_table, progress_bar, say
 from starcal_uq.core import settings
 
-_COLUMNS = (
-    "place",
-    "method",
-    "quantity",
-    "printed",
-    "main_mean",
-    "main_spread",
-    "main_z",
-    "outcome",
-)
+# Of the page's table, what a terminal has room for.
+_COLUMNS = ("Place", "Number", "Printed", "Ours", "z", "Outcome")
 
 
 def reproduce_command(
@@ -34,6 +26,7 @@ def reproduce_command(
     lack.
     """
     from starcal_uq.paper.reproduction import reproduce
+    from starcal_uq.paper.show.tables import printed_numbers
 
     with progress_bar("reproduction") as progress:
         found = reproduce(
@@ -47,11 +40,11 @@ def reproduce_command(
             study=study,
             force=force,
         )
-    published = found.published()
-    show_table(published, "What the paper prints, and what comes out over seeds", _COLUMNS)
+    title = "What the paper prints, and mean ± spread over seeds under the main reading"
+    print_table(printed_numbers(found.judged).part(_COLUMNS, title))
     say(found.text)
     say(f"Report: {found.report.resolve()}")
-    return Answer({"report": found.report, "published": published, "text": found.text})
+    return Answer({"report": found.report, "published": found.published(), "text": found.text})
 
 
 def reproduce_field_command(

@@ -45,8 +45,8 @@ def julian_days(
     each time is (n,).
 
     A time is ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as "+02:00"
-    is understood), `datetime.datetime` or `numpy.datetime64`, UTC without an offset, or of astropy. CatalogueError
-    quotes one that is not readable, with its place among several, from 1.
+    is understood), `datetime.datetime` or `numpy.datetime64`, UTC without an offset, or a `Time` of
+    astropy. CatalogueError quotes one that is not readable, with its place among several, from 1.
     """
     times = np.atleast_1d(np.asarray(plain("time_utc", time_utc))).astype(str)
     unique, inverse = np.unique(times, return_inverse=True)

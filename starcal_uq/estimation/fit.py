@@ -62,7 +62,7 @@ from starcal_uq.observations.table import Observations
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong
 # distortion.
 _FAR = 0.05
-# Stars that are explained to this, px per axis, are the ones they are said to be.
+# Stars whose residuals are below this, px per axis, are identified correctly.
 _PLAIN_NOISE_PX = 1.0
 # Frames and stars of a sample that is near enough to the minimum of all.
 _SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
@@ -130,7 +130,7 @@ def _near(likelihood: MarginalLikelihood, camera: Camera) -> Stage | None:
 def _way(
     pairs: PairObjective, camera: Camera, search: Search, refinement: Search, near: Stage
 ) -> Way:
-    """What leads to an estimate through interstar angles, or else from `near`."""
+    """Stages to an estimate through interstar angles, or else from `near`."""
     own = MarginalLikelihood(pairs.frames, camera.distortion)
     try:
         stages, _ = _stages(pairs, camera, own, search, refinement)

@@ -11,7 +11,7 @@ import html
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.formatting import MINUS, pretty_unit, significant
@@ -51,6 +51,13 @@ class TextTable:
     def records(self) -> list[dict[str, str]]:
         """The cells of each row by their heads."""
         return [dict(zip(self.heads, row, strict=True)) for row in self.rows]
+
+    def part(self, heads: Sequence[str], title: str) -> TextTable:
+        """Some of its columns, each the first under its head, with a title of their own."""
+        places = [self.heads.index(head) for head in heads]
+        rows = tuple(tuple(row[place] for place in places) for row in self.rows)
+        align = "".join(self.align[place] for place in places)
+        return replace(self, heads=tuple(heads), rows=rows, align=align, title=title)
 
     @classmethod
     def of(

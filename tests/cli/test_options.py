@@ -297,3 +297,8 @@ def test_a_remedy_of_a_run_file_repeats_nothing_that_was_given(monkeypatch, tmp_
     wanted = f"starcal-uq run {file} --set seed=3 --set effects=field,tails --force"
     assert as_given(remedy) == wanted
     expand([], declared.app.commands)
+
+
+def test_help_lists_the_distortion_models(commands):
+    (model,) = (one for one in commands["run"].params if one.name == "model")
+    assert f"One of: {', '.join(sc.camera.model_names())}, or one of" in model.help

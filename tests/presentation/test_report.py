@@ -617,3 +617,11 @@ def test_a_table_that_just_fits_the_terminal_keeps_its_last_column(monkeypatch, 
     monkeypatch.setattr(console, "out", Console(width=80))
     console.print_table(TextTable(heads, (row,)))
     assert "0.0231" in capsys.readouterr().out
+
+
+def test_part_of_a_table_takes_the_first_of_two_columns_of_one_name():
+    from starcal_uq.presentation.tables import TextTable
+
+    whole = TextTable(("Name", "z", "Best", "z"), (("f", "1", "a", "2"),), align="lrlr")
+    part = whole.part(("z", "Name"), "Two columns")
+    assert part == TextTable(("z", "Name"), (("1", "f"),), "Two columns", "rl")

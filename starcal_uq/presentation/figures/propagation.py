@@ -127,7 +127,7 @@ def glance_residuals(cal: Calibration, obs: Observations) -> Axes | None:
 
 
 def glance_field(field: FieldMap) -> Axes:
-    """What of a direction no rotation takes away, for a first page."""
+    """Uncertainty of directions without the best constant rotation, for the first page."""
     ax = style.new_axes(3.5, 3.1)
     _panel(ax, field, field.sigma_compensated_arcsec, None, "", "")
     return ax

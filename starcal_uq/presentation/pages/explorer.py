@@ -73,7 +73,7 @@ def _study(study: Study) -> AnyDict:
 
 
 def _coupling(coupling: Coupling) -> AnyDict:
-    """What the script needs to add measurements of single parameters."""
+    """Data from which the script adds measurements of single parameters."""
     return {
         "correlation": coupling.extended_correlation.tolist(),
         "sigma": [*coupling.sigma_marginal, *coupling.common_rotation_arcsec],
