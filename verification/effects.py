@@ -4,7 +4,7 @@ five times the size that gains twice what it has to, and all pairs at twice that
     python verification/effects.py [--replicates 40] [--only field frame]
     python verification/effects.py --pairs --replicates 10 --write
 
-One row a campaign: how often just the planted effects are chosen and how often one that is not
+One line a campaign: how often just the planted effects are chosen and how often one that is not
 there, how often the 95 % interval of the scale holds what was planted (where that is a standard
 deviation), and coverage of the camera's parameters by their 95 % intervals. Without an effect the
 camera is the one that is planted, with axes, a field or a radial wave the one that is nearest to
@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import combinations, groupby
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,8 @@ KINDS = (
 DRAWN = ("frame", "star")
 FRAMES, STARS, NIGHTS = 30, 20, 3
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "effects.md"
+# Sizes of what is planted, px, and shares over its campaigns.
+Row = tuple[dict[str, float], dict[str, float]]
 
 
 def observed(seed: int, sizes: dict[str, float]) -> tuple[Campaign, sc.Observations]:
@@ -136,6 +138,35 @@ def pairs(kinds: list[str]) -> Iterator[dict[str, float]]:
         yield {kind: 2.0 * limits[kind] for kind in both}
 
 
+def by_effect(rows: list[Row]) -> str:
+    """A row of each effect, with its sizes and the shares of each."""
+    keys = ("chosen", "others", "scale", "covered", "rms")
+    lines = ["| Simulated | px | Chosen | Others | Scale | Covered | rms z |", "|---" * 7 + "|"]
+    for names, group in groupby(rows, key=lambda row: list(row[0])):
+        sizes, found = zip(*group, strict=True)
+        cells = [", ".join(f"{size[name]:.3f}" for size in sizes for name in names)]
+        cells += [", ".join(f"{one[key]:.2f}" for one in found) for key in keys]
+        cells = ["–" if not cell or "nan" in cell else cell for cell in cells]
+        lines.append(f"| {' | '.join(names or ['nothing'])} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def by_pair(rows: list[Row]) -> str:
+    """A matrix of effects: above the diagonal how often both are chosen, below it coverage."""
+    found = {tuple(sizes): shares for sizes, shares in rows}
+    kinds = list(dict.fromkeys(kind for pair in found for kind in pair))
+
+    def cell(one: str, other: str) -> str:
+        above = found.get((one, other))
+        below = found.get((other, one))
+        return f"{above['chosen']:.2f}" if above else f"{below['covered']:.2f}" if below else "–"
+
+    lines = [f"| | {' | '.join(kinds)} |", "|---" * (len(kinds) + 1) + "|"]
+    for one in kinds:
+        lines.append(f"| {one} | {' | '.join(cell(one, other) for other in kinds)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--replicates", type=int, default=40)
@@ -143,20 +174,14 @@ def main() -> None:
     parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.name}")
     arguments = parser.parse_args()
-    lines: list[str] = []
-
-    def add(line: str) -> None:
-        lines.append(line)
-        print(line, flush=True)
-
-    add("| planted, px | chosen | others | scale | covered | rms z |")
-    add("|---|---|---|---|---|---|")
+    rows: list[Row] = []
     for sizes in (pairs if arguments.pairs else alone)(arguments.only):
-        found = row(sizes, arguments.replicates)
-        names = ", ".join(f"{name} {size:.3f}" for name, size in sizes.items()) or "nothing"
-        add(f"| {names} | " + " | ".join(f"{value:.3f}" for value in found.values()) + " |")
+        rows.append((sizes, row(sizes, arguments.replicates)))
+        print(*rows[-1], flush=True)
+    made = by_pair(rows) if arguments.pairs else by_effect(rows)
+    print(made)
     if arguments.write:
-        put(PAGE, "effect pairs" if arguments.pairs else "effects alone", "\n".join(lines))
+        put(PAGE, "effect pairs" if arguments.pairs else "effects alone", made)
 
 
 if __name__ == "__main__":
