@@ -62,15 +62,19 @@ def main() -> None:
     arguments = parser.parse_args()
     # Figures take most of the time of a run.
     drawing.draw_figures = lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>")
-    lines = [f"| {' | '.join(HEADS)} |", f"|{' --- |' * len(HEADS)}"]
+    together: dict[tuple[str, ...], list[str]] = {}
     with without_painting():
         for name in PLANTED:
             if arguments.only in name:
-                lines.append(f"| {' | '.join(row(name, chain(name, arguments.seed)))} |")
-                print(lines[-1], flush=True)
+                _, *outcome = row(name, chain(name, arguments.seed))
+                together.setdefault(tuple(outcome), []).append(name)
+                print(name, *outcome, sep=" | ", flush=True)
     if arguments.write:
         note = f"Made by `python verification/remedies.py --seed {arguments.seed} --write`; do not edit."
-        put(PAGE, "remedies", f"{note}\n\n" + "\n".join(lines))
+        # Misfits with one outcome share a row.
+        rows = [HEADS, ["---"] * 4, *(("; ".join(v), *key) for key, v in together.items())]
+        table = "\n".join(f"| {' | '.join(line)} |" for line in rows)
+        put(PAGE, "remedies", f"{note}\n\n{table}")
 
 
 if __name__ == "__main__":
