@@ -121,7 +121,8 @@ def run_row(
     load = os.getloadavg()[0]
     runs = take_turns(row.contestants, repeats or row.repeats, start, tell, seconds)
     for run in runs:
-        drawn = [turn.result for turn in run.turns.values() if "draws" in turn.result]
+        done = [run.first, *run.turns.values()]
+        drawn = [turn.result for turn in done if turn is not None and "draws" in turn.result]
         for result in drawn:
             result["moments"] = moments(result["draws"])
         for result in drawn[:1]:
