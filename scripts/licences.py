@@ -25,11 +25,10 @@ HEAD = """# Licences
 `starcal_uq` is under the MIT licence, except one table: the example data (`stars.ecsv`) were measured in images by the
 European Space Agency and are under CC BY-SA 3.0 IGO (`starcal_uq/pipeline/data/esa/NOTICE`).
 
-The table lists all direct and indirect dependencies in any supported version of Python, extras included, with the
-licences in their metadata (made by `make supply`). We distribute none of them. You can replace those under the LGPL
-(*casadi*, *sep*).
+The table (made by `make supply`) lists all direct and indirect dependencies in any supported version of Python, extras
+included, by the licences in their metadata. We distribute none of them. You can replace those under the LGPL.
 
-| Package | Licence |
+| Licence | Packages |
 |---|---|
 """
 
@@ -105,8 +104,12 @@ def main() -> None:
         table |= json.loads(made)
     if unpinned := sorted(set(table) - pinned):
         raise SystemExit(f"constraints.txt does not pin {', '.join(unpinned)}")
+    packages = {
+        kind: [name for name in sorted(table) if table[name] == kind] for kind in table.values()
+    }
     PAGE.write_text(
-        HEAD + "".join(f"| {name} | {table[name]} |\n" for name in sorted(table)), "utf-8"
+        HEAD + "".join(f"| {kind} | {', '.join(packages[kind])} |\n" for kind in sorted(packages)),
+        "utf-8",
     )
 
 
