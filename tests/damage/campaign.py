@@ -214,22 +214,23 @@ def _judged(counts: dict[str, int]) -> Counter[str]:
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
-    """The results in Markdown: a row of each reader, with its files."""
+    """The results in Markdown: of files of text, binary files, and all."""
     lines = [
-        "| Read by | Files | Damaged | Refused | Wrong | Slowest, s |",
+        "|  | Files | Damaged | Refused | Wrong | Slowest, s |",
         "|---|---|" + "---:|" * 4,
     ]
-    groups: dict[str, list[str]] = {}
-    for sample in SAMPLES:
-        if sample.file in results:
-            groups.setdefault(sample.reads[0], []).append(sample.file)
-    groups["all"] = [file for files in groups.values() for file in files]
-    for reader, files in groups.items():
+    tried = [sample for sample in SAMPLES if sample.file in results]
+    groups = {
+        "text": [sample.file for sample in tried if not sample.binary],
+        "binary": [sample.file for sample in tried if sample.binary],
+        "**all**": [sample.file for sample in tried],
+    }
+    for name, files in groups.items():
         counts = sum((_judged(results[file]["counts"]) for file in files), Counter[str]())
-        name, shown = ("**all**", "") if reader == "all" else (f"`{reader}`", ", ".join(files))
+        slowest = max((results[file]["slowest_s"] for file in files), default=0.0)
         numbers = (counts.total(), counts["refused"], counts["wrong"])
-        slowest = max(results[file]["slowest_s"] for file in files)
         cells = " | ".join(f"{number:,}" for number in numbers)
+        shown = len(files) if name == "**all**" else ", ".join(files)
         lines.append(f"| {name} | {shown} | {cells} | {slowest:.2f} |")
     return "\n".join(lines)
 

@@ -340,13 +340,6 @@ def files_of(subject: str) -> list[str]:
     return [path.relative_to(ROOT).as_posix() for path in found if path.name != "__init__.py"]
 
 
-def functions(found: Iterable[Mutant]) -> int:
-    """In how many functions (a class and a file count as one for what is outside its own) some
-    mutants are.
-    """
-    return len({(mutant.file, mutant.function) for mutant in found})
-
-
 def drawn(found: dict[str, Mutant], seed: int, before: Iterable[str] = ()) -> list[str]:
     """Keys of the mutants that a seed draws, in the order of the source; without those `before` and
     of lower seeds.
@@ -694,11 +687,7 @@ def draw(subject: str, seed: int) -> None:
         commit = subprocess.run(
             ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False
         ).stdout
-        made = {
-            "commit": commit.strip(),
-            "mutants": len(found),
-            "functions": functions(found.values()),
-        }
+        made = {"commit": commit.strip(), "mutants": len(found)}
         keys = drawn(found, seed, before)
         kept.write_text(
             json.dumps({"subject": subject, "seed": seed, **made, "keys": keys}), "utf-8"
@@ -770,35 +759,25 @@ def run(one: dict[str, Any], again: bool) -> None:
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """The table of the documentation."""
+    """The table of the documentation: the last draw of each subject."""
     from starcal_uq.maths.intervals import binomial_interval
 
     lines = [
-        "| Subject | Mutants | In functions | Seed | Tried | Killed at first | By time | Share "
-        "(95 %) | "
-        "Killed now | Gone | Left |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| Subject | Mutants | Seed | Tried | Killed at first | Share (95 %) | Killed now | Gone | "
+        "Left |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
-    for one in found:
-        if len(one["first"]) < 0.4 * len(one["keys"]):
-            # A few say nothing yet.
-            continue
+    # A few that were tried say nothing yet.
+    enough = [one for one in found if len(one["first"]) >= 0.4 * len(one["keys"])]
+    enough.sort(key=lambda one: one["seed"])
+    for one in {one["subject"]: one for one in enough}.values():
         first, last = [*one["first"].values()], Counter(one["last"].values())
-        n, late, survived = len(first), first.count("timeout"), first.count("survived")
+        n, survived = len(first), first.count("survived")
         low, high = binomial_interval(n - survived, n)
         tried = f"{n}" if n == len(one["keys"]) else f"{n} of {len(one['keys'])}"
         share = f"{100 * (n - survived) / n:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
         killed, gone, left = last["killed"] + last["timeout"], last["gone"], last["survived"]
-        row = (
-            one["subject"],
-            one["mutants"],
-            one["functions"],
-            one["seed"],
-            tried,
-            n - survived,
-            late,
-            share,
-        )
+        row = (one["subject"], one["mutants"], one["seed"], tried, n - survived, share)
         lines.append(f"| {' | '.join(map(str, (*row, killed, gone, left)))} |")
     return "\n".join(lines)
 
@@ -815,7 +794,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--show", action="store_true", help="print what survived")
     parser.add_argument(
-        "--write", action="store_true", help="put the table of all draws into the documentation"
+        "--write", action="store_true", help="put the table of last draws into the documentation"
     )
     options = parser.parse_args(arguments)
     OUT.mkdir(parents=True, exist_ok=True)
