@@ -58,7 +58,7 @@ def predicted(obs: sc.Observations, cal: sc.Calibration, frame: int) -> tuple[fl
     for weighing in found.weighing if found else ():
         if weighing.dof is not None:  # The scale of a Student t is less than its deviation.
             variance *= weighing.dof / (weighing.dof - 2.0)
-    likelihood = MarginalLikelihood(one, cal.camera.distortion, axes=True)
+    likelihood = MarginalLikelihood(one, cal.camera.distortion)
     state, _ = likelihood.profile(cal.theta)
     h = likelihood.derivatives(cal.theta, state).reshape(len(cal.theta), -1)
     e = state.e.ravel()

@@ -63,7 +63,7 @@ def with_effects_of(
     held = cal.effects
     known = effects_of(whole, cal.camera, seen=seen, zeniths=held.zeniths, extent=held.extent)
     found = [known[own.name] for own in held.fitted if own.name in known]
-    frames = StarFrames.from_observations(obs, axes=True)
+    frames = StarFrames.from_observations(obs)
     ratio = {effect.name: held.ratio(cal.sigma)[effect.name] for effect in found}
     at = (cal.theta, rotations, cal.sigma)
     return EffectLikelihood(frames, cal.camera.distortion, found, ratio, *at)
@@ -94,7 +94,7 @@ def images_beside(
     if errors is not None:
         stars = star_effect(StarModel(some, float(cal.theta[2])))
         ratio = {stars.name: (errors.tau_px / errors.sigma) ** 2}
-        frames = StarFrames.from_observations(some, axes=True)
+        frames = StarFrames.from_observations(some)
         at = (cal.theta, rotations, errors.sigma)
         likelihood = EffectLikelihood(frames, model, [stars], ratio, *at)
     elif has_effects(cal):
@@ -150,13 +150,13 @@ class Freed:
         `gram` (p + 1, p + 1): products of parameters and residuals, attitudes removed.
         """
         if has_effects(cal):
-            yield cls.of(obs, cal, axes=True)
+            yield cls.of(obs, cal)
             return
         inner, unit = gram[:-1, :-1], 1.0 / np.sqrt(np.diag(gram)[:-1])
         values, vectors = principal(inner * np.outer(unit, unit), _ABSORBED)
         turn = (unit[:, None] * vectors / np.sqrt(values)).T
         along = turn @ gram[:-1, -1]
-        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         start = quaternion_to_rotation(cal.quaternions)
         for part, state, columns, rows in likelihood.linearised(
             cal.theta, np.ones(len(unit)), start, _STARS_AT_ONCE
@@ -166,12 +166,12 @@ class Freed:
             yield cls(part.frames, a, h, e, floats(2.0 * part.frames.sizes - 3.0), rows)
 
     @classmethod
-    def of(cls, obs: Observations, cal: Calibration, axes: bool) -> Freed:
-        """Those of a calibration with effects; with `axes` as in `MarginalLikelihood`. Stars have
-        what the calibration took for their error.
+    def of(cls, obs: Observations, cal: Calibration) -> Freed:
+        """Those of a calibration with effects. Stars have what the calibration took for their
+        error.
         """
         rotations = quaternion_to_rotation(cal.quaternions)
-        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes)
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         state, _ = likelihood.profile(cal.theta, rotations)
         frames, e = likelihood.frames, state.e
         held = effects_beside(obs, cal)

@@ -153,7 +153,7 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
     axes = noise.axes
     if obs.noise_axes is not None:
-        alike, axes = Freed.of(obs, cal, axes=False), AxisSums()
+        alike, axes = Freed.of(replace(obs, noise_axes=None), cal), AxisSums()
         axes.add(alike.frames, alike.a, alike.h, alike.e)
     names = "noise that differs between the axes", "noise whose axes correlate"
     known = noise_model_of(cal)

@@ -125,7 +125,7 @@ def predictive_check(
     limit = max(1, min(obs.n_frames, _MAX_STARS * obs.n_frames // obs.n_stars))
     used = weighed(obs, cal)
     some, places = frame_sample(used, limit, seed)
-    part = MarginalLikelihood(some, cal.camera.distortion, axes=True)
+    part = MarginalLikelihood(some, cal.camera.distortion)
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
     e, h = state.e, part.derivatives(cal.theta, state)
     exact: EffectLikelihood | None = None

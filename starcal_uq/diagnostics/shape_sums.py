@@ -49,7 +49,7 @@ class ShapeSums:
     """
 
     def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
-        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         p, theta, effects = len(cal.theta), cal.theta, effects_beside(obs, cal)
         self.p, self.dof = p, likelihood.dof - p
         self.names, self.n_stars = cal.parameter_names, obs.n_stars

@@ -102,7 +102,7 @@ class Stars:
         extent: Extent | None = None,
     ) -> None:
         self.obs, self.around, self.extent = obs, around, extent
-        self.likelihood = MarginalLikelihood(obs, around.camera.distortion, axes=True)
+        self.likelihood = MarginalLikelihood(obs, around.camera.distortion)
         if rotations is not None:
             self.likelihood.use_rotations(rotations)
         self.dof = self.likelihood.dof
@@ -236,7 +236,7 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
         for name, value in logs.items()
     }
     exact = EffectLikelihood(
-        MarginalLikelihood(obs, cal.camera.distortion, axes=True).frames,
+        MarginalLikelihood(obs, cal.camera.distortion).frames,
         cal.camera.distortion,
         effects,
         ratio,

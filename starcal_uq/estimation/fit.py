@@ -171,7 +171,7 @@ def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
 
     CalibrationError as for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
     """
-    likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
+    likelihood = MarginalLikelihood(obs, camera.distortion)
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     search, refinement = Search(), None
@@ -187,7 +187,7 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
 
     CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
-    likelihood = MarginalLikelihood(obs, model, axes=True)
+    likelihood = MarginalLikelihood(obs, model)
     start = cal.nominal.replace(distortion=model)
     start = start.with_theta(undistorted(model, start.theta))
     check_count(likelihood, start)
@@ -288,7 +288,7 @@ def _with_noise_model(
     model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
     if model.varies:
         obs = obs.weighted(model.sigma_px(obs), model.axes)
-        likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
+        likelihood = MarginalLikelihood(obs, camera.distortion)
         likelihood.use_rotations(likelihood.start_rotations(theta))
         # The estimate from interstar angles has no weights; its covariance and the refinement do.
         search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
@@ -323,7 +323,7 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
 def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
     search = Search(settings.solver, settings.max_iterations)
     nu = None if settings.dof is None else parse_dof(settings.dof, CalibrationError)
-    frames = StarFrames.from_observations(obs, axes=True)
+    frames = StarFrames.from_observations(obs)
     check_count(MarginalLikelihood(frames, camera.distortion), camera)
     model = camera.distortion
 

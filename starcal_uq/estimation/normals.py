@@ -78,7 +78,7 @@ class FrameNormals:
         """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K,
         3, 3) or QUEST's.
         """
-        likelihood = MarginalLikelihood(obs, model, axes=True)
+        likelihood = MarginalLikelihood(obs, model)
         found = likelihood.frame_normals(theta, start)
         return cls.of(theta, *found, 2 * likelihood.frames.sizes - 3, scale)
 

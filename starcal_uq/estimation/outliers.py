@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
+from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
@@ -170,20 +170,16 @@ def _compare(
     in_use: BoolArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """t, residual (px) and offset (rad) of every star seen, (n,) each."""
-    model, weight = likelihood.model_name, 1.0 if seen.weight is None else seen.weight
-    b = seen.rotated(state.rotations)
+    own, b = MarginalLikelihood(seen, likelihood.model_name), seen.rotated(state.rotations)
     with np.errstate(all="ignore"):
-        chord = np.linalg.norm(unproject_theta(model, theta, seen.pixel.T).T - b, axis=0)
+        chord = np.linalg.norm(unproject_theta(own.model_name, theta, seen.pixel.T).T - b, axis=0)
         offset = 2.0 * np.arcsin(np.minimum(chord / 2.0, 1.0))
-        xy, d_theta, d_phi = forward_kernel(model, "first")(
-            seen.n_stars, theta, b, forward_root(model, theta, b)
-        )
-        e = (seen.pixel - xy) * weight
+        xy, d_theta, d_phi = own.first(theta, b)
+        e = seen.pixel - xy
+        seen.whiten(e)
     near = in_use | ((offset < _ELSEWHERE_RAD) & np.isfinite(e).all(axis=0))
     # The values of stars elsewhere are replaced below; here they must only not disturb.
-    e, d_theta, d_phi = (
-        np.where(near, value, 0.0) for value in (e, d_theta * weight, d_phi * weight)
-    )
+    e, d_theta, d_phi = (np.where(near, value, 0.0) for value in (e, d_theta, d_phi))
     inverse = seen.spread(state.inverse)
     response = seen.spread(
         likelihood.attitude_response(state, likelihood.derivatives(theta, state))
@@ -201,5 +197,5 @@ def _compare(
     det = np.where(det > 1e-12, det, np.inf)
     deleted = np.stack([yy * e[0] - xy_ * e[1], xx * e[1] - xy_ * e[0]]) / det
     t = np.sum(e * deleted, axis=0)
-    residual = np.hypot(*np.where(in_use, deleted, e)) / weight
+    residual = np.hypot(*seen.in_pixels(np.where(in_use, deleted, e)))
     return np.where(near, t, np.inf), np.where(near, residual, offset * theta[2]), offset

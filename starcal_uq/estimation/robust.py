@@ -391,7 +391,7 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
     }
     weights = tail_weights(obs, cal, record)
     weighted = by_weights(obs, weights)
-    likelihood = MarginalLikelihood(weighted, cal.camera.distortion, axes=True)
+    likelihood = MarginalLikelihood(weighted, cal.camera.distortion)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     normal = likelihood.evaluate(cal.theta)
     sigma = float(np.sqrt(normal.cost / (likelihood.dof - len(cal.theta))))
@@ -413,7 +413,7 @@ def tail_weights(obs: Observations, cal: Calibration, record: AnyDict) -> FloatA
     degrees of freedom.
     """
     model = cal.camera.distortion
-    frames = StarFrames.from_observations(obs, axes=True)
+    frames = StarFrames.from_observations(obs)
     likelihood = StudentLikelihood(
         frames,
         model,

@@ -130,7 +130,7 @@ def without_ties(obs: Observations, cal: Calibration) -> Calibration:
     """
     if cal.ties is None:
         return cal
-    likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     stages, settings = [*cal.stages[:-1]], dict(cal.provenance.settings)
     found = assemble(

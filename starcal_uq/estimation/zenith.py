@@ -56,7 +56,7 @@ class Images:
         likelihood: MarginalLikelihood | None = None,
     ) -> None:
         if likelihood is None:
-            likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+            likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         self.obs, self.camera, self.likelihood = obs, cal.camera, likelihood
         self.state, _ = likelihood.profile(cal.theta, rotations)
         self.view = View.of(likelihood, self.state, cal.theta, slice(None))

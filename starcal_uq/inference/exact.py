@@ -55,10 +55,10 @@ class ExactMarginal:
             return tied
         if cal.effects and cal.effects.fitted:
             effects = cal.effects.of(obs, cal.camera)
-            frames = StarFrames.from_observations(obs, axes=True)
+            frames = StarFrames.from_observations(obs)
             at = (theta, quaternion_to_rotation(cal.quaternions), cal.sigma)
             return EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)
-        one = MarginalLikelihood(obs, model, axes=True)
+        one = MarginalLikelihood(obs, model)
         if len(cal.quaternions) == one.frames.n_frames:
             one.use_rotations(quaternion_to_rotation(cal.quaternions))
         one.use_sums(*one.sums(theta))
@@ -89,7 +89,7 @@ class FrameSample:
             if len(cal.quaternions) == obs.n_frames
             else None
         )
-        frames = StarFrames.from_observations(some, axes=True)
+        frames = StarFrames.from_observations(some)
         self._exact = MarginalLikelihood(frames, cal.camera.distortion)
         if rotations is not None:
             self._exact.use_rotations(rotations)

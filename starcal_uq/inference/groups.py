@@ -330,11 +330,8 @@ class _Images:
         import xarray as xr
 
         flat = (pixels - self._predicted).reshape(-1, *self._predicted.shape)
-        weight = self._at.frames.weight
-        whitened = flat if weight is None else flat * weight
-        rest = self._at.frames.in_pixels(
-            self._at.gaussian.project_out(self._at.reference, whitened)
-        )
+        self._at.frames.whiten(flat)
+        rest = self._at.frames.in_pixels(self._at.gaussian.project_out(self._at.reference, flat))
         rest = rest.reshape(pixels.shape)
         values = (pixels[..., 0, :], pixels[..., 1, :], rest[..., 0, :], rest[..., 1, :])
         named = zip(_PIXELS, values, strict=True)

@@ -274,9 +274,7 @@ class _Images:
         project: Callable[..., Any] = forward_kernel(model, "attitude")
         rows = []
         for draw, bad in zip(draws, folded, strict=True):
-            noise = rng.standard_normal((2, n)) * draw[-1]
-            if self.frames.weight is not None:
-                noise = noise / self.frames.weight
+            noise = self.frames.in_pixels(rng.standard_normal((2, n)) * draw[-1])
             theta = draw[:-1]
             if bad:
                 rows.append(self._nothing())

@@ -71,16 +71,10 @@ class Profile:
 
 
 class MarginalLikelihood:
-    """Exact attitude-marginalised likelihood of a table of observations.
+    """Exact attitude-marginalised likelihood of a table of observations."""
 
-    With `axes` it knows the noise of x and y apart, where a noise model has fitted it; without,
-    stars are weighed alike along both.
-    """
-
-    def __init__(self, obs: Observations | StarFrames, model_name: str, axes: bool = False) -> None:
-        self.frames = (
-            obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes)
-        )
+    def __init__(self, obs: Observations | StarFrames, model_name: str) -> None:
+        self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
         self.model_name = model_name
         self._rotations: FloatArray | None = None
         self._last: tuple[NormalSums, Attitudes] | None = None

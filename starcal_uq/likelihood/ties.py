@@ -209,7 +209,7 @@ class TiedLikelihood(MarginalLikelihood):
     """
 
     def __init__(self, obs: Observations, model_name: str, ties: Ties, sigma: float) -> None:
-        super().__init__(obs, model_name, axes=True)
+        super().__init__(obs, model_name)
         self.ties, self.sigma = ties, sigma
 
     @property

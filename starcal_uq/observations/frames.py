@@ -52,16 +52,14 @@ class StarFrames:
     }
 
     @classmethod
-    def from_observations(cls, obs: Observations, axes: bool = False) -> StarFrames:
-        """Take the arrays that estimators need; with `axes`, the noise of x and y is what a noise
-        model found.
-        """
+    def from_observations(cls, obs: Observations) -> StarFrames:
+        """Take the arrays that estimators need."""
         return cls(
             pixel=np.ascontiguousarray(obs.xy.T),
             r=np.ascontiguousarray(obs.directions_icrs.T),
             weight=None if obs.sigma_px is None else 1.0 / obs.sigma_px,
             starts=obs.frame_starts,
-            axes=obs.noise_axes if axes else None,
+            axes=obs.noise_axes,
         )
 
     @classmethod

@@ -170,7 +170,7 @@ class SeenEffects:
         """What noise-free frames at the camera's own parameters say."""
         effects, scales = self._known(camera, frames, mag), self.planned.scales
         run = [effect for effect in effects if effect.grouping == "run"]
-        likelihood = MarginalLikelihood(frames, camera.distortion, axes=True)
+        likelihood = MarginalLikelihood(frames, camera.distortion)
         state, _ = likelihood.profile(camera.theta, rotations)
         columns = Columns.of(effects, likelihood, state, camera.theta, slice(None))
         slopes = likelihood.derivatives(camera.theta, state)

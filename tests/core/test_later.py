@@ -140,7 +140,7 @@ def test_the_slope_is_that_of_the_log_likelihood() -> None:
     for model in ("brown", "inverse", "fisheye", "k1+axes"):
         camera = sc.paper.paper_camera().replace(distortion=model)
         for table in (obs, replace(obs, sigma_px=noise), uneven):
-            likelihood = MarginalLikelihood(table, model, axes=True)
+            likelihood = MarginalLikelihood(table, model)
             sums, attitudes = likelihood.sums(camera.theta)
             likelihood.use_sums(sums, attitudes)
             widths = sigma / np.sqrt(np.diag(sums.matrix))

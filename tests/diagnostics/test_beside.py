@@ -48,16 +48,16 @@ def test_noise_is_looked_at_where_effects_are_free() -> None:
     """What is left does not know how large the effects were."""
     obs, cals = planted()
     cal = cals["auto"]
-    free = Freed.of(obs, cal, axes=True)
+    free = Freed.of(obs, cal)
     shifted = replace(obs, x_px=obs.x_px + 1e-4 * (obs.x_px / 1024.0) ** 2)
-    again = Freed.of(shifted, cal, axes=True)
+    again = Freed.of(shifted, cal)
     np.testing.assert_allclose(again.e, free.e, atol=1e-6)
     dof = free.frame_dof.sum() - len(free.h)
     scatter = float(np.sqrt(np.sum(free.e**2) / dof))
     assert scatter == pytest.approx(0.05, rel=4.0 / np.sqrt(2.0 * dof))
     # Control: a shift of as much that no effect holds shows in full.
     rough = replace(obs, x_px=obs.x_px + 1e-4 * np.sin(7.0 * obs.x_px))
-    assert np.abs(Freed.of(rough, cal, axes=True).e - free.e).max() > 5e-5
+    assert np.abs(Freed.of(rough, cal).e - free.e).max() > 5e-5
 
 
 def test_images_without_effects_have_the_same_optimum() -> None:

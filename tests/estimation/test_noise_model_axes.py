@@ -137,7 +137,7 @@ def test_shapes_are_whitened_as_their_residuals_are():
     obs, camera = given(observed(TURNED, 4))
     cal = sc.calibrate(obs, camera, effects="noise")
     obs, families = weighed(obs, cal), shapes(obs, cal.camera)
-    part = MarginalLikelihood(obs, "brown", axes=True)
+    part = MarginalLikelihood(obs, "brown")
     state, _ = part.profile(cal.theta)
     view = View.of(part, state, cal.theta, slice(None))
     cells = families[-1].columns(view)

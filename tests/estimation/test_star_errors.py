@@ -64,7 +64,7 @@ def dense(obs, cal, model, ratio):
 
 def exact_likelihood(obs, cal, tau_px, sigma):
     stars = star_effect(StarModel(obs, cal.theta[2]))
-    frames, ratio = StarFrames.from_observations(obs, axes=True), {"star": (tau_px / sigma) ** 2}
+    frames, ratio = StarFrames.from_observations(obs), {"star": (tau_px / sigma) ** 2}
     at = (cal.theta, quaternion_to_rotation(cal.quaternions), sigma)
     return EffectLikelihood(frames, "brown", [stars], ratio, *at)
 
