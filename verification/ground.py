@@ -60,7 +60,7 @@ def predicted(obs: sc.Observations, cal: sc.Calibration, frame: int) -> tuple[fl
             variance *= weighing.dof / (weighing.dof - 2.0)
     likelihood = MarginalLikelihood(one, cal.camera.distortion)
     state, _ = likelihood.profile(cal.theta)
-    h = likelihood.derivatives(cal.theta, state).reshape(len(cal.theta), -1)
+    h = state.slopes.reshape(len(cal.theta), -1)
     e = state.e.ravel()
     covariance = variance * np.eye(e.size)
     if found is None or not found.fitted:

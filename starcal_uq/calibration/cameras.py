@@ -143,7 +143,7 @@ def focals_of(
         if not np.isfinite(cost):
             return none
         # A focal length that is longer by one per cent is a pattern that is larger by as much.
-        slope = likelihood.slopes(theta, state)[2] * start_px
+        slope = likelihood.slopes(state)[2] * start_px
         curvature = ideal.sum(np.sum(slope**2, axis=0))
         step = ideal.sum(np.sum(slope * state.e, axis=0)) / curvature
         log_scale -= np.clip(step, -0.2, 0.2)

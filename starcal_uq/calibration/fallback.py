@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.calibration.plausibility import find_reason
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, next_simpler, simpler_models
@@ -131,8 +130,7 @@ def _as_richer(
     """The likelihood of a richer model, and the estimate of a calibration in it: what it lacks is
     zero.
     """
-    likelihood = MarginalLikelihood(weighed(obs, cal), richer)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    likelihood = MarginalLikelihood(weighed(obs, cal), richer, cal.rotations)
     return likelihood, cal.camera.replace(distortion=richer).theta
 
 

@@ -213,10 +213,10 @@ class _Air:
 
     def noise(self) -> NoiseModel:
         """Fit the noise that the images have without the air that was found."""
-        images, theta = self._alone, self._cal.theta
+        images = self._alone
         likelihood, state = images.likelihood, images.state
         shifts, _, taken = self._taken(self.seen_px)
-        left = shifts[0] - np.tensordot(taken, likelihood.derivatives(theta, state), 1)
+        left = shifts[0] - np.tensordot(taken, state.slopes, 1)
         if has_effects(self._cal) and isinstance(likelihood, EffectLikelihood):
             # Effects have taken their part of it off the images already.
             left = likelihood.conditioned(state, left[None])[0][0]

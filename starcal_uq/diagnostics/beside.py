@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation import effects
 from starcal_uq.estimation.normals import FrameNormals
@@ -89,7 +88,7 @@ def images_beside(
         obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed
     )
     some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
-    model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
+    model, rotations = cal.camera.distortion, cal.rotations[chosen]
     likelihood = None
     if errors is not None:
         stars = star_effect(StarModel(some, float(cal.theta[2])))
@@ -115,7 +114,7 @@ def normals_beside(obs: Observations, cal: Calibration) -> FrameNormals:
     Those of frames are marginalised in each; those of the run and of stars, which frames share, are
     as the calibration has them.
     """
-    exact = with_effects_of(obs, cal, quaternion_to_rotation(cal.quaternions), obs)
+    exact = with_effects_of(obs, cal, cal.rotations, obs)
     return FrameNormals.beside(exact, cal.theta)
 
 
@@ -157,9 +156,8 @@ class Freed:
         turn = (unit[:, None] * vectors / np.sqrt(values)).T
         along = turn @ gram[:-1, -1]
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-        start = quaternion_to_rotation(cal.quaternions)
         for part, state, columns, rows in likelihood.linearised(
-            cal.theta, np.ones(len(unit)), start, _STARS_AT_ONCE
+            cal.theta, np.ones(len(unit)), cal.rotations, _STARS_AT_ONCE
         ):
             a, h = part.attitudes(state).orthonormal, np.tensordot(turn, columns[:-1], axes=1)
             e = columns[-1] - np.tensordot(along, h, axes=1)
@@ -170,7 +168,7 @@ class Freed:
         """Those of a calibration with effects. Stars have what the calibration took for their
         error.
         """
-        rotations = quaternion_to_rotation(cal.quaternions)
+        rotations = cal.rotations
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         state, _ = likelihood.profile(cal.theta, rotations)
         frames, e = likelihood.frames, state.e
@@ -185,7 +183,7 @@ class Freed:
         basis = np.concatenate([likelihood.attitudes(state).orthonormal, of_frames])
         unit = np.broadcast_to(np.eye(len(basis))[:, :, None], (len(basis),) * 2 + rank.shape)
         own = ByFrame(frames, basis, unit)
-        h = np.concatenate([likelihood.slopes(cal.theta, state), columns.run])
+        h = np.concatenate([likelihood.slopes(state), columns.run])
         scale = np.linalg.norm(h.reshape(len(h), -1), axis=1)
         h = own.removed_from(h / np.where(scale > 0.0, scale, 1.0)[:, None, None])
         h = orthonormal(h.reshape(len(h), -1), _ABSORBED).reshape(-1, *e.shape)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
@@ -126,8 +125,8 @@ def predictive_check(
     used = weighed(obs, cal)
     some, places = frame_sample(used, limit, seed)
     part = MarginalLikelihood(some, cal.camera.distortion)
-    state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
-    e, h = state.e, part.derivatives(cal.theta, state)
+    state, _ = part.profile(cal.theta, cal.rotations[places])
+    e, h = state.e, state.slopes
     exact: EffectLikelihood | None = None
     if has_effects(cal):
         exact = with_effects_of(some, cal, state.rotations, used)

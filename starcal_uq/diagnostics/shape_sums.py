@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import (
     by_frame,
@@ -61,9 +60,9 @@ class ShapeSums:
         of_frames = None if held else EffectSums([*effects, frame], theta, cal.sigma, apart=False)
         # Degrees of freedom that scale and shape of every frame by itself take.
         self.places, self.block_rank, square = sums.places, 0, 0.0
-        rotations = quaternion_to_rotation(cal.quaternions)
+        rotations = cal.rotations
         for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
-            h = part.derivatives(theta, state)
+            h = state.slopes
             fitted = part.project_out(state, np.concatenate([h, state.e[None]]))
             sums.add(part, state, fitted, rows)
             if of_frames is not None:

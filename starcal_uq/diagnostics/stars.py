@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
@@ -230,7 +229,7 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     if not used.any():
         return _Likeness(0, 0)
     frames, numbers = StarFrames.from_observations(obs).select(used), numbers[used]
-    rotations = quaternion_to_rotation(cal.quaternions[np.isin(cal.frame_ids, obs.frame[used])])
+    rotations = cal.rotations[np.isin(cal.frame_ids, obs.frame[used])]
     stars = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
     sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
     p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)

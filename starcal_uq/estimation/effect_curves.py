@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.attitude.earth import tangents
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.likelihood.shapes import TIME_DEGREE, run_clock, seconds_utc
 from starcal_uq.likelihood.star_errors import StarModel
@@ -196,7 +195,7 @@ def found_zeniths(cal: Calibration, true_zeniths: FloatArray | None = None) -> F
     found = cal.effects
     if found is None or found.zeniths is None:
         return None
-    rotations = quaternion_to_rotation(cal.quaternions)
+    rotations = cal.rotations
     boresights = rotations[np.searchsorted(cal.frame_ids, found.zeniths.frame_ids), 2]
     place = found.at("zenith")
     zeniths = found.zeniths.moved(found.coefficients[place], boresights)

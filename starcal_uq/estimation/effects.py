@@ -16,7 +16,6 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import (
     exp_rotation,
-    quaternion_to_rotation,
     rotation_to_quaternion,
 )
 from starcal_uq.camera.camera import Camera
@@ -102,9 +101,7 @@ class Stars:
         extent: Extent | None = None,
     ) -> None:
         self.obs, self.around, self.extent = obs, around, extent
-        self.likelihood = MarginalLikelihood(obs, around.camera.distortion)
-        if rotations is not None:
-            self.likelihood.use_rotations(rotations)
+        self.likelihood = MarginalLikelihood(obs, around.camera.distortion, rotations)
         self.dof = self.likelihood.dof
         self._known: tuple[Zeniths | None, dict[str, Effect]] | None = None
 
@@ -171,7 +168,7 @@ def with_effects(
     CalibrationError
         For an effect that is unknown, or that the table does not allow.
     """
-    rotations = quaternion_to_rotation(cal.quaternions)
+    rotations = cal.rotations
     return with_effects_of(Stars(obs, Around.of(cal), rotations), cal, wanted)
 
 
@@ -241,7 +238,7 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
         effects,
         ratio,
         theta,
-        quaternion_to_rotation(cal.quaternions),
+        cal.rotations,
         sigma,
         None if extent is None else held.coefficients,
     )
@@ -266,7 +263,7 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
         )
     held = replace(held, fitted=tuple(fitted))
     own = rest.state, rest.coefficients
-    held = local_coefficients(held, exact, *own, theta, covariance, sigma)
+    held = local_coefficients(held, exact, *own, covariance, sigma)
     if held.zeniths is not None:
         place = held.at("zenith")
         air = held.coefficients[place], held.covariance[place, place]
@@ -335,7 +332,7 @@ class _Linearised:
 
     def __init__(self, stars: Stars, cal: Calibration) -> None:
         self._stars, self._cal = stars, cal
-        self._rotations = quaternion_to_rotation(cal.quaternions)
+        self._rotations = cal.rotations
 
     def restricted(
         self, names: Sequence[str], zeniths: Zeniths | None, sigma: float | None = None
@@ -407,7 +404,7 @@ class _Linearised:
 
 def without_effects(obs: Observations, cal: Calibration) -> Observations:
     """The stars where the camera of a calibration with effects alone would show them."""
-    return shown_by(obs, cal.camera, quaternion_to_rotation(cal.quaternions), cal.residuals_px)
+    return shown_by(obs, cal.camera, cal.rotations, cal.residuals_px)
 
 
 def shown_by(

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.attitude.wahba import DegenerateFrameError
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, undistorted
@@ -187,11 +186,10 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
 
     CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
-    likelihood = MarginalLikelihood(obs, model)
+    likelihood = MarginalLikelihood(obs, model, cal.rotations)
     start = cal.nominal.replace(distortion=model)
     start = start.with_theta(undistorted(model, start.theta))
     check_count(likelihood, start)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     theta = cal.camera.replace(distortion=model).theta
     search = Search(tolerance=_gain(likelihood, _LAST_STEP), seen=False)
     stage = refinement_stage(likelihood, theta, search)
@@ -309,7 +307,7 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
             frames,
             cal.camera.distortion,
             theta,
-            quaternion_to_rotation(cal.quaternions),
+            cal.rotations,
             None if nu == "free" else nu,
             max_iterations,
         )

@@ -18,18 +18,16 @@ def local_coefficients(
     likelihood: EffectLikelihood,
     state: Profile,
     found: Cross,
-    theta: FloatArray,
     covariance: FloatArray,
     sigma: float,
 ) -> Effects:
     """The effects with `frames` and `frame_sigmas` (K, c), `stars` and `star_sigmas` (S, 2), px.
 
-    `found` are the best coefficients at `theta` (p,), whose `covariance` (p, p) and whose effects of
+    `found` are the best coefficients at an estimate, whose `covariance` (p, p) and whose effects of
     the run are in the deviations; those of stars take the attitudes and frames as known.
     """
     solved = likelihood.solved
-    moved = likelihood.project_out(state, likelihood.derivatives(theta, state))
-    follow = solved.coefficients(likelihood.columns.cross(moved))
+    follow = solved.coefficients(likelihood.columns.cross(likelihood.slopes(state)))
     own = solved.frame_vectors * solved.frame_root[:, None, :]
     by_run = own @ solved.frame_run
     run = sigma**2 * solved.run_covariance

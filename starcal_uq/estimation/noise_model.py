@@ -69,7 +69,7 @@ def _held(
     and all parameters (p, 2, N) span.
     """
     state, _ = likelihood.profile(theta)
-    h = likelihood.slopes(theta, state)
+    h = likelihood.slopes(state)
     flat = h.reshape(len(h), -1)
     camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
     return state, likelihood.attitudes(state).orthonormal, camera
@@ -356,7 +356,7 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
     """
     likelihood = MarginalLikelihood(obs, camera.distortion)
     state, _ = likelihood.profile(camera.theta)
-    h = likelihood.slopes(camera.theta, state)
+    h = likelihood.slopes(state)
     whitened = model.sigma_px(obs) / obs.sigma_or_one
     turned = (
         h if model.axes is None else np.einsum("pxn,xy->pyn", h, np.linalg.cholesky(model.axes))

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.residual_map import FrameScatter
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
@@ -62,9 +61,7 @@ class FrameNormals:
     @classmethod
     def at(cls, obs: Observations, cal: Calibration) -> FrameNormals:
         """Normal equations at the estimate of a calibration."""
-        return cls.around(
-            obs, cal.camera.distortion, cal.theta, quaternion_to_rotation(cal.quaternions)
-        )
+        return cls.around(obs, cal.camera.distortion, cal.theta, cal.rotations)
 
     @classmethod
     def around(
@@ -98,7 +95,7 @@ class FrameNormals:
         _, found = exact.conditioned(state, state.e[None])
         shared = exact.shifts(state, replace(found, frame=0.0 * found.frame))
         e = exact.project_out(state, state.e[None]) - shared
-        columns = np.concatenate([exact.slopes(theta, state), e])
+        columns = np.concatenate([exact.slopes(state), e])
         gram = products_by_frame(exact.frames, columns, columns)
         cross = products_by_frame(exact.frames, exact.columns.frame, columns)
         solved = exact.solved
@@ -209,7 +206,7 @@ class StarNormals:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         frames, p = likelihood.frames, len(cal.theta)
         term = star_term(numbers, frames.r, float(cal.theta[2]))
-        start, gram = quaternion_to_rotation(cal.quaternions), np.zeros((p + 1, p + 1))
+        start, gram = cal.rotations, np.zeros((p + 1, p + 1))
         s = term.n_groups
         scores, slopes, matrices = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, p, p))
         response = np.zeros((s, 2, p))

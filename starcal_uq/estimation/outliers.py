@@ -181,9 +181,7 @@ def _compare(
     # The values of stars elsewhere are replaced below; here they must only not disturb.
     e, d_theta, d_phi = (np.where(near, value, 0.0) for value in (e, d_theta, d_phi))
     inverse = seen.spread(state.inverse)
-    response = seen.spread(
-        likelihood.attitude_response(state, likelihood.derivatives(theta, state))
-    )
+    response = seen.spread(likelihood.attitude_response(state, state.slopes))
     g = d_theta - np.einsum("pcn,cxn->pxn", response, d_phi)
     used = g[:, :, in_use].reshape(len(theta), -1)
     normal = used @ used.T

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px, unproject
@@ -263,6 +264,11 @@ class Calibration(Deferring, Shown, Traced):
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in order."""
         return self.camera.parameter_names
+
+    @property
+    def rotations(self) -> FloatArray:
+        """Attitudes (K, 3, 3) at the estimate, R_cam_icrs."""
+        return quaternion_to_rotation(self.quaternions)
 
     @property
     def remedy(self) -> str:

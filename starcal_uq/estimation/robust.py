@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import undistorted
 from starcal_uq.camera.projection import unproject_theta
@@ -391,8 +390,7 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
     }
     weights = tail_weights(obs, cal, record)
     weighted = by_weights(obs, weights)
-    likelihood = MarginalLikelihood(weighted, cal.camera.distortion)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    likelihood = MarginalLikelihood(weighted, cal.camera.distortion, cal.rotations)
     normal = likelihood.evaluate(cal.theta)
     sigma = float(np.sqrt(normal.cost / (likelihood.dof - len(cal.theta))))
     alone = np.sqrt(np.diag(scaled_inverse(normal.matrix))) * sigma
@@ -418,7 +416,7 @@ def tail_weights(obs: Observations, cal: Calibration, record: AnyDict) -> FloatA
         frames,
         model,
         np.array(record["theta"]),
-        quaternion_to_rotation(cal.quaternions),
+        cal.rotations,
         usable_stars(frames, model, cal.pair_theta),
     )
     state = likelihood.state(np.array(record["theta"]), record["sigma"], record["dof"])

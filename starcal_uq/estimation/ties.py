@@ -11,7 +11,6 @@ import numpy as np
 from starcal_uq.attitude.relative import RelativeAttitudes
 from starcal_uq.attitude.rotations import (
     exp_rotation,
-    quaternion_to_rotation,
     rotation_to_quaternion,
 )
 from starcal_uq.core.errors import CalibrationError
@@ -73,8 +72,8 @@ def with_ties(
         rotations that have nothing to do with these frames.
     """
     began = perf_counter()
-    likelihood = TiedLikelihood(obs, cal.camera.distortion, ties_of(obs, given), cal.sigma)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    ties = ties_of(obs, given)
+    likelihood = TiedLikelihood(obs, cal.camera.distortion, ties, cal.sigma, cal.rotations)
     before = _Squares(likelihood, cal.theta, cal.sigmas)
     _refuse_others(before, likelihood.ties)
     dof = likelihood.dof - len(cal.theta)
@@ -130,8 +129,7 @@ def without_ties(obs: Observations, cal: Calibration) -> Calibration:
     """
     if cal.ties is None:
         return cal
-    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion, cal.rotations)
     stages, settings = [*cal.stages[:-1]], dict(cal.provenance.settings)
     found = assemble(
         obs,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.noise_model import axes_p, star_squares, uneven_p
 from starcal_uq.estimation.weights import weighed
@@ -56,8 +55,7 @@ def gains(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> dict
     from scipy.special import chdtri
 
     frames = StarFrames.from_observations(weighed(obs, cal))
-    likelihood = MarginalLikelihood(frames, cal.camera.distortion)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    likelihood = MarginalLikelihood(frames, cal.camera.distortion, cal.rotations)
     squares, share = star_squares(likelihood, cal.theta)
     freed, found = 2.0 * squares / share, {}
     if not tails:

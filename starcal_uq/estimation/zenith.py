@@ -60,7 +60,7 @@ class Images:
         self.obs, self.camera, self.likelihood = obs, cal.camera, likelihood
         self.state, _ = likelihood.profile(cal.theta, rotations)
         self.view = View.of(likelihood, self.state, cal.theta, slice(None))
-        h = likelihood.derivatives(cal.theta, self.state)
+        h = self.state.slopes
         self.basis, self._triangle = np.linalg.qr(likelihood.whitened(self.state, h).T)
         self.e = self.cleared(likelihood.whitened(self.state, self.state.e[None]))[0]
         self.dof = max(likelihood.dof - len(h), 1)

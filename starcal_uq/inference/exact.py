@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import compress
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
@@ -50,17 +49,14 @@ class ExactMarginal:
         model, theta = cal.camera.distortion, cal.theta
         if cal.ties is not None:
             ties = Ties.of(obs.frame_ids, cal.ties.known)
-            tied = TiedLikelihood(obs, model, ties, cal.ties.sigma)
-            tied.use_rotations(quaternion_to_rotation(cal.quaternions))
-            return tied
+            return TiedLikelihood(obs, model, ties, cal.ties.sigma, cal.rotations)
         if cal.effects and cal.effects.fitted:
             effects = cal.effects.of(obs, cal.camera)
             frames = StarFrames.from_observations(obs)
-            at = (theta, quaternion_to_rotation(cal.quaternions), cal.sigma)
+            at = (theta, cal.rotations, cal.sigma)
             return EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)
-        one = MarginalLikelihood(obs, model)
-        if len(cal.quaternions) == one.frames.n_frames:
-            one.use_rotations(quaternion_to_rotation(cal.quaternions))
+        same = len(cal.quaternions) == obs.n_frames
+        one = MarginalLikelihood(obs, model, cal.rotations if same else None)
         one.use_sums(*one.sums(theta))
         return one
 
@@ -84,15 +80,9 @@ class FrameSample:
         )
         self._summed, whole = cal.log_likelihood, cal.compressed
         covariance = whole.whitening @ whole.whitening.T
-        rotations = (
-            quaternion_to_rotation(cal.quaternions)[places]
-            if len(cal.quaternions) == obs.n_frames
-            else None
-        )
+        rotations = cal.rotations[places] if len(cal.quaternions) == obs.n_frames else None
         frames = StarFrames.from_observations(some)
-        self._exact = MarginalLikelihood(frames, cal.camera.distortion)
-        if rotations is not None:
-            self._exact.use_rotations(rotations)
+        self._exact = MarginalLikelihood(frames, cal.camera.distortion, rotations)
         self._exact.use_sums(*self._exact.sums(whole.theta_hat))
         n_batches = min(BATCHES, some.n_frames)
         self._batch = np.arange(some.n_frames) % BATCHES

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError, check_known
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import calibrated
@@ -346,7 +345,7 @@ def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> So
 
     nu = parse_dof(dof, SamplingError)
     frames = StarFrames.from_observations(obs)
-    rotations = quaternion_to_rotation(cal.quaternions)
+    rotations = cal.rotations
     fit = refine(frames, cal.camera.distortion, cal.theta, rotations, nu, _MAX_REFINEMENT)
     if not fit.stage.status.ok:
         raise SamplingError(

@@ -52,15 +52,16 @@ class Profile:
 
     rotations: FloatArray  # (K, 3, 3): R_cam_icrs
     b: FloatArray  # (3, N): catalogue directions in the camera frame
-    # (2, N): residuals, observed minus predicted, divided by the stated noise where there is one
+    # (2, N): residuals, observed minus predicted, divided by the stated noise where there is one;
+    # what little the attitudes could still explain is taken off
     e: FloatArray
     # (3, 2, N): derivative of the (whitened) prediction with respect to the frame's rotation
     # vector.
     attitude: FloatArray
+    # (p, 2, N): derivatives of the (whitened) prediction with respect to theta at fixed attitudes
+    slopes: FloatArray
     inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
     log_determinant: FloatArray  # (K,): log |A^T A|
-    # (p, 2, N): derivatives of the (whitened) prediction with respect to theta, where they are known
-    slopes: FloatArray | None = None
 
     def shifts(self, moves: FloatArray) -> FloatArray:
         """Whitened shifts (..., 2, N) of images by small moves (..., 3, N) of the stars, camera
@@ -71,12 +72,19 @@ class Profile:
 
 
 class MarginalLikelihood:
-    """Exact attitude-marginalised likelihood of a table of observations."""
+    """Exact attitude-marginalised likelihood of a table of observations.
 
-    def __init__(self, obs: Observations | StarFrames, model_name: str) -> None:
+    `rotations` (K, 3, 3): where attitude searches start; QUEST's by default.
+    """
+
+    def __init__(
+        self,
+        obs: Observations | StarFrames,
+        model_name: str,
+        rotations: FloatArray | None = None,
+    ) -> None:
         self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
-        self.model_name = model_name
-        self._rotations: FloatArray | None = None
+        self.model_name, self._rotations = model_name, rotations
         self._last: tuple[NormalSums, Attitudes] | None = None
 
     @property
@@ -91,10 +99,9 @@ class MarginalLikelihood:
 
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""
-        return attitudes(self.frames, self.model_name, theta, self._quest_weights())
-
-    def _quest_weights(self) -> FloatArray | None:
-        return None if self.frames.weight is None else self.frames.weight**2
+        weight = self.frames.weight
+        weight = None if weight is None else weight**2
+        return attitudes(self.frames, self.model_name, theta, weight)
 
     def profile(
         self,
@@ -107,73 +114,29 @@ class MarginalLikelihood:
 
         With `rotations`, theta may be that of every star, (p, N). Attitudes are the best ones to
         `tolerance`, rad. The second value is the sum of squared whitened residuals S(theta);
-        infinite when the model is not finite.
+        infinite when the model is not finite, or stars fit no attitude.
         """
         theta, frames = np.asarray(theta, dtype=np.float64), self.frames
-        n, k = frames.n_stars, frames.n_frames
-        state = Profile(
-            rotations=np.empty((k, 3, 3)),
-            b=np.empty((3, n)),
-            e=np.empty((2, n)),
-            attitude=np.empty((3, 2, n)),
-            inverse=np.empty((3, 3, k)),
-            log_determinant=np.empty(k),
-        )
-        total = 0.0
         with np.errstate(all="ignore"):
             if rotations is None:
                 rotations = self.start_rotations(theta)
-            # Blocks whose arrays stay in the cache while their attitudes are searched.
-            for first, last in frames.parts(BLOCK_STARS):
-                stars = slice(int(frames.starts[first]), int(frames.starts[last]))
-                own = theta if theta.ndim == 1 else theta[:, stars]
-                total += self._settle(
-                    state, slice(first, last), stars, own, rotations[first:last], tolerance
-                )
-        # Noise-free data leave rounding, of either sign.
-        return state, max(total, 0.0) if np.isfinite(total) else float("inf")
-
-    def _settle(
-        self,
-        state: Profile,
-        which: slice,
-        stars: slice,
-        theta: FloatArray,
-        rotations: FloatArray,
-        tolerance: float,
-    ) -> float:
-        """Search the attitudes of some frames and write the model at them into `state`; the sum of
-        squares, or NaN.
-        """
-        part = self.frames.part(which.start, which.stop)
-        n = part.n_stars
-        e, a = np.empty((2, n)), np.empty((3, 2, n))
-        kernel, cost = forward_kernel(self.model_name, "attitude"), np.nan
-        for _ in range(ATTITUDE_STEPS):
-            b = part.rotated(rotations)
-            kernel.into((theta, b, forward_root(self.model_name, theta, b)), (e, a.reshape(6, n)))
-            np.subtract(part.pixel, e, out=e)
-            part.whiten(e)
-            part.whiten(a)
-            inverse, determinant = _inverse(part, a)
-            slope = part.sum(np.sum(a * e[None], axis=1))
-            step = np.einsum("ijk,jk->ik", inverse, slope)
-            left = float(np.sum(e * e) - np.sum(step * slope))
-            if not np.isfinite(left):
-                break
-            if np.max(np.abs(step)) < tolerance:
-                cost = left
-                break
-            # Stars that fit no attitude never come here for the last time: nothing there is a
-            # minimum.
-            rotations = exp_rotation(step.T) @ rotations
-        state.rotations[which], state.inverse[..., which], state.log_determinant[which] = (
-            rotations,
-            inverse,
-            np.log(determinant),
-        )
-        state.b[:, stars], state.e[:, stars], state.attitude[..., stars] = b, e, a
-        return cost
+            for _ in range(ATTITUDE_STEPS):
+                b = frames.rotated(rotations)
+                xy, h, a = self.first(theta, b)
+                e = frames.pixel - xy
+                frames.whiten(e)
+                inverse, determinant = _inverse(frames, a)
+                slope = frames.sum(np.einsum("ixn,xn->in", a, e))
+                turn = np.einsum("ijk,jk->ik", inverse, slope)
+                e -= np.einsum("ixn,in->xn", a, frames.spread(turn))
+                state = Profile(rotations, b, e, a, h, inverse, np.log(determinant))
+                cost = float(np.sum(e * e))
+                if not np.isfinite(cost):
+                    break
+                if np.max(np.abs(turn), initial=0.0) < tolerance:
+                    return state, cost
+                rotations = exp_rotation(turn.T) @ rotations
+        return state, float("inf")
 
     def rotations_at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta."""
@@ -263,12 +226,6 @@ class MarginalLikelihood:
             )
         return values
 
-    def derivatives(self, theta: FloatArray, state: Profile) -> FloatArray:
-        """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed
-        attitudes.
-        """
-        return self.first(theta, state.b)[1] if state.slopes is None else state.slopes
-
     def first(self, theta: FloatArray, b: FloatArray) -> list[FloatArray]:
         """Pixels (2, N) and their whitened derivatives by theta (p, 2, N) and by the frame's rotation
         (3, 2, N).
@@ -293,9 +250,9 @@ class MarginalLikelihood:
         """Remove from columns (q, 2, N) what a rotation of each frame can reproduce."""
         return self.attitudes(state).removed_from(columns)
 
-    def slopes(self, theta: FloatArray, state: Profile) -> FloatArray:
-        """`derivatives` (p, 2, N) without what a rotation of each frame can reproduce."""
-        return self.project_out(state, self.derivatives(theta, state))
+    def slopes(self, state: Profile) -> FloatArray:
+        """Slopes of a state, (p, 2, N), without what a rotation of each frame can reproduce."""
+        return self.project_out(state, state.slopes)
 
     def linearised(
         self,
@@ -308,7 +265,7 @@ class MarginalLikelihood:
         of the residuals, attitudes projected out.
         """
         for part, state, rows in self.pieces(theta, rotations, max_stars):
-            h = part.slopes(theta, state) * scale[:, None, None]
+            h = part.slopes(state) * scale[:, None, None]
             yield part, state, np.concatenate([h, state.e[None]]), rows
 
     def pieces(
@@ -331,26 +288,8 @@ class MarginalLikelihood:
         `rotations` (K, 3, 3) of all.
         """
         part = MarginalLikelihood(self.frames.part(first, last), self.model_name)
-        start = rotations[first:last]
-        state, turn = part._at(theta, start)
-        if turn >= ATTITUDE_TOLERANCE_RAD:
-            _, found = settled_sums(part.frames, self.model_name, theta, start)
-            state, _ = part._at(theta, found.at(theta))
+        state, _ = part.profile(theta, rotations[first:last])
         return part, state, slice(int(self.frames.starts[first]), int(self.frames.starts[last]))
-
-    def _at(self, theta: FloatArray, rotations: FloatArray) -> tuple[Profile, float]:
-        """The model at these attitudes (K, 3, 3), with the residuals of the best ones to first
-        order, and the largest turn to these, rad.
-        """
-        frames, b = self.frames, self.frames.rotated(rotations)
-        xy, h, a = self.first(theta, b)
-        e = frames.pixel - xy
-        frames.whiten(e)
-        inverse, determinant = _inverse(frames, a)
-        turn = np.einsum("ijk,jk->ik", inverse, frames.sum(np.einsum("ixn,xn->in", a, e)))
-        e -= np.einsum("ixn,in->xn", a, frames.spread(turn))
-        state = Profile(rotations, b, e, a, inverse, np.log(determinant), h)
-        return state, float(np.max(np.abs(turn), initial=0.0))
 
     def frame_normals(
         self, theta: FloatArray, rotations: FloatArray | None = None

@@ -60,7 +60,7 @@ class View:
     @classmethod
     def of(cls, part: MarginalLikelihood, state: Profile, theta: FloatArray, rows: slice) -> View:
         """The stars of `part`, which are these rows of the table."""
-        parameter_columns = part.frames.in_pixels(part.derivatives(theta, state))
+        parameter_columns = part.frames.in_pixels(state.slopes)
         return cls(rows, part, state, parameter_columns, theta[:2])
 
     @property

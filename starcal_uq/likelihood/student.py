@@ -25,6 +25,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
@@ -276,11 +277,8 @@ class StudentLikelihood:
         """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed
         attitudes.
         """
-        _, h, _ = forward_kernel(self.model_name, "first")(
-            self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
-        )
+        _, h, _ = MarginalLikelihood(self.frames, self.model_name).first(theta, state.b)
         h[..., ~state.seen] = 0.0
-        self.frames.whiten(h)
         return h
 
     def information(self, theta: FloatArray, state: StudentState, sigma: float) -> Information:

@@ -208,8 +208,15 @@ class TiedLikelihood(MarginalLikelihood):
     alone.
     """
 
-    def __init__(self, obs: Observations, model_name: str, ties: Ties, sigma: float) -> None:
-        super().__init__(obs, model_name)
+    def __init__(
+        self,
+        obs: Observations,
+        model_name: str,
+        ties: Ties,
+        sigma: float,
+        rotations: FloatArray | None = None,
+    ) -> None:
+        super().__init__(obs, model_name, rotations)
         self.ties, self.sigma = ties, sigma
 
     @property

@@ -173,7 +173,7 @@ class SeenEffects:
         likelihood = MarginalLikelihood(frames, camera.distortion)
         state, _ = likelihood.profile(camera.theta, rotations)
         columns = Columns.of(effects, likelihood, state, camera.theta, slice(None))
-        slopes = likelihood.derivatives(camera.theta, state)
+        slopes = state.slopes
         turns = -likelihood.attitudes(state).coefficients(slopes)
         run_turns = columns.attitudes.coefficients(columns.raw)
         response = np.concatenate([turns, -run_turns]).transpose(2, 1, 0)

@@ -181,8 +181,7 @@ def frame_matrices(
     """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of noise-free
     frames.
     """
-    likelihood = MarginalLikelihood(frames, camera.distortion)
-    likelihood.use_rotations(rotations)
+    likelihood = MarginalLikelihood(frames, camera.distortion, rotations)
     _, attitudes = likelihood.sums(camera.theta)
     gram, *_ = likelihood.frame_normals(camera.theta, attitudes.rotations)
     return (

@@ -481,7 +481,7 @@ def _star_spread(
     camera, m = geometry.camera, geometry.n_frames
     likelihood = MarginalLikelihood(frames, camera.distortion)
     state, _ = likelihood.profile(camera.theta, geometry.rotations)
-    h = likelihood.slopes(camera.theta, state)
+    h = likelihood.slopes(state)
     numbers = np.unique(geometry.star, return_inverse=True)[1]
     z = star_term(numbers, frames.r, camera.focal_px).columns(likelihood, state, slice(None))
     score = offset_px * np.einsum("pxn,jxn->pjn", h, z)

@@ -67,7 +67,7 @@ def test_sums_are_products_of_columns_without_attitudes(stated):
     view = View.of(part, state, cal.theta, slice(None))
     many = np.concatenate([family.columns(view) for family in families])
     part.frames.whiten(many)
-    h = part.derivatives(cal.theta, state)
+    h = state.slopes
     columns = np.concatenate([h, state.e[None], many])
     size = np.linalg.norm(columns, axis=(1, 2))
     flat = part.project_out(state, columns).reshape(len(columns), -1) / size[:, None]
@@ -102,7 +102,7 @@ def test_control_shapes_that_the_fit_absorbed_are_not_nominal():
     )
     likelihood = MarginalLikelihood(obs, "brown")
     state, _ = likelihood.profile(cal.theta)
-    h = likelihood.derivatives(cal.theta, state)
+    h = state.slopes
     view = View.of(likelihood, state, cal.theta, slice(None))
     naive, _ = np.linalg.qr(family.columns(view).reshape(family.size, -1).T)
     fitted = likelihood.project_out(state, h).reshape(len(h), -1)

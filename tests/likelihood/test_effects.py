@@ -36,7 +36,7 @@ def dense(
     if not settled:
         state, _ = likelihood.profile(cal.theta)
     frames = likelihood.frames
-    h = likelihood.derivatives(cal.theta, state) * cal.sigmas[:, None, None]
+    h = state.slopes * cal.sigmas[:, None, None]
     x = np.concatenate([state.e[None], h]).reshape(6, -1)
     member = np.repeat(np.arange(frames.n_frames), frames.sizes)
     own = [np.where(member == k, state.attitude, 0.0) for k in range(frames.n_frames)]
@@ -71,7 +71,7 @@ def test_sums_are_products_with_the_inverse_of_the_dense_covariance(scene):
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
     sums = EffectSums(list(effects_of(obs, cal.camera).values()), cal.theta)
     for part, state, rows in likelihood.pieces(cal.theta, None, 20):
-        h = part.derivatives(cal.theta, state) * cal.sigmas[:, None, None]
+        h = state.slopes * cal.sigmas[:, None, None]
         columns = part.project_out(state, np.concatenate([state.e[None], h]))
         sums.add(part, state, columns, rows)
     solved = sums.solved(RATIO)

@@ -65,7 +65,7 @@ def test_derivatives_are_whitened_and_no_model_is_likeliest_where_it_is_not_fini
     )
     state, _ = likelihood.profile(theta)
     # A principal point shifts every star, in units of its own noise.
-    along, across = likelihood.derivatives(theta, state)[0]
+    along, across = state.slopes[0]
     assert np.allclose(along, likelihood.frames.weight, rtol=1e-12)
     assert np.max(np.abs(across)) == 0.0
     assert likelihood.log_likelihood(np.array([*theta[:2], np.nan, *theta[3:]]), 1.0) == -np.inf
@@ -99,7 +99,7 @@ def test_information_is_the_schur_complement_of_the_attitudes():
     likelihood = MarginalLikelihood(obs, "brown")
     theta = camera().theta
     state, _ = likelihood.profile(theta)
-    h = likelihood.derivatives(theta, state).reshape(5, -1).T
+    h = state.slopes.reshape(5, -1).T
     n, k = obs.n_stars, obs.n_frames
     a = np.zeros((2, n, 3 * k))
     for frame in range(k):

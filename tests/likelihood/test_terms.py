@@ -67,13 +67,13 @@ def dense(likelihood, state, term, ratio):
 @pytest.mark.parametrize("by_group", [True, False])
 @pytest.mark.parametrize("grouping", ["frame", "star", "run"])
 def test_products_and_determinant_are_those_of_the_covariance(seen, grouping, by_group):
-    likelihood, theta, state = seen
+    likelihood, _, state = seen
     groups = groups_of(likelihood, grouping)
     ratio = np.random.default_rng(1).uniform(0.4, 4.0, 2 * (int(groups.max()) + 1)) ** 2
     term = Term(groups, int(groups.max()) + 1, stretch)
     w, z = dense(likelihood, state, term, ratio)
     sums = TermSums(term)
-    columns = np.concatenate([likelihood.derivatives(theta, state), state.e[None]])
+    columns = np.concatenate([state.slopes, state.e[None]])
     projected = likelihood.project_out(state, columns)
     sums.add(likelihood, state, projected, slice(None))
     flat, left = columns.reshape(len(columns), -1), projected.reshape(len(columns), -1)

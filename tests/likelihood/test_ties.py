@@ -26,7 +26,7 @@ def pieces(obs: sc.Observations, cal: sc.Calibration) -> tuple[np.ndarray, ...]:
     """Residuals and derivatives (p + 1, 2 N), attitude columns (3 K, 2 N), attitudes (K, 3, 3)."""
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
     state, _ = likelihood.profile(cal.theta)
-    h = likelihood.derivatives(cal.theta, state)
+    h = state.slopes
     member = np.repeat(np.arange(K), likelihood.frames.sizes)
     own = [np.where(member == k, state.attitude, 0.0) for k in range(K)]
     x = np.concatenate([state.e[None], h]).reshape(6, -1)

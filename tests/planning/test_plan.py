@@ -224,7 +224,7 @@ def test_a_forecast_that_forgets_the_attitudes_fails():
     found, cam = some_frames(), camera()
     likelihood = MarginalLikelihood(found.frames, cam.distortion)
     state, _ = likelihood.profile(cam.theta, found.rotations)
-    h = likelihood.derivatives(cam.theta, state)
+    h = state.slopes
     wrong = np.moveaxis(found.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
     forgetful = Forecaster(found, Outlook(n_campaigns=50), wrong).forecast((10, 30))
     check = replace(small_check(), forecast=forgetful)
