@@ -190,4 +190,4 @@ class Freed:
         e = own.removed_from(e[None])[0]
         e = e - np.tensordot(np.tensordot(h, e, axes=2), h, axes=1)
         dof = floats(2.0 * frames.sizes - 3.0 - rank)
-        return cls(frames, basis, h, np.asarray(e), dof, slice(0, frames.n_stars))
+        return cls(frames, basis, h, e, dof, slice(0, frames.n_stars))

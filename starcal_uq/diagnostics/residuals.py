@@ -73,7 +73,7 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
     else:
         obs = weighed(obs, cal)
         stated = obs.sigma_or_one
-        residuals, use = np.asarray(cal.residuals_px), heard(obs, cal)
+        residuals, use = cal.residuals_px, heard(obs, cal)
         scale2 = _unit_scale(cal, obs.n_stars) ** 2
         if not use.all():
             # The scale of the t is not the scatter of those that it hears.
@@ -109,7 +109,7 @@ def heard(obs: Observations, cal: Calibration) -> BoolArray:
     plain = by_noise_model(obs, cal)
     size = np.max(np.abs(cal.residuals_px / plain.sigma_or_one[:, None]), axis=1)
     # Stars that the likelihood leaves out, such as those of a frame without an attitude, have none.
-    use = np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.tail_scale))
+    use = (size > 0.0) & (size < OUTLIER_SIGMA * cal.tail_scale)
     order = np.searchsorted(cal.frame_ids, obs.frame)
     return np.asarray(use & (np.bincount(order, use, len(cal.frame_ids)) >= 3)[order])
 
@@ -182,7 +182,7 @@ def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, .
     Quantities that the table lacks, or that do not vary, are left out.
     """
     obs = weighed(obs, cal)
-    residuals = np.asarray(cal.residuals_px).T
+    residuals = cal.residuals_px.T
     predicted = obs.xy.T - residuals
     offset = predicted - cal.theta[:2, None]
     unit = offset / np.maximum(np.hypot(*offset), 1e-9)

@@ -89,7 +89,7 @@ class ShapeSums:
 
     @property
     def _unit(self) -> FloatArray:
-        return np.asarray(1.0 / np.sqrt(np.diag(self.gram)[: self.p]))
+        return 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
 
     def seen(self, left: FloatArray, at: slice) -> tuple[FloatArray, FloatArray]:
         """Directions (j, r) of some columns, in units of their lengths, and squares (r,) of what

@@ -67,7 +67,7 @@ def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
             "a calibration without fingerprints of its frames cannot be checked: calibrate again."
         )
     if b is None:
-        return np.asarray(a.frame_ids[repeats(present[0])])
+        return a.frame_ids[repeats(present[0])]
     pairs = shared(*present)
     return np.column_stack([a.frame_ids[pairs[:, 0]], b.frame_ids[pairs[:, 1]]])
 

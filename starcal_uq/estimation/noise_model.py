@@ -364,7 +364,7 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
     flat, noisy = h.reshape(len(h), -1), (turned * whitened).reshape(len(h), -1)
     inverse = scaled_inverse(flat @ flat.T)
     real = inverse @ (noisy @ noisy.T) @ inverse
-    return np.asarray(np.sqrt(np.diag(real) / np.diag(inverse)) / sigma)
+    return np.sqrt(np.diag(real) / np.diag(inverse)) / sigma
 
 
 class _Stars(NamedTuple):

@@ -109,13 +109,13 @@ class FrameScatter:
     @property
     def formal(self) -> FloatArray:
         """Covariance (p, p) of z if noise is Gaussian and independent."""
-        return np.asarray(np.linalg.inv(self.matrix) * self.squares / (self.dof - len(self.theta)))
+        return np.linalg.inv(self.matrix) * self.squares / (self.dof - len(self.theta))
 
     @property
     def jackknife(self) -> FloatArray:
         """Covariance (p, p) of z from the estimates that leave one frame out."""
         k, mean = self.n_frames, self.steps[0, 1:] / self.n_frames
-        return np.asarray((self.steps[1:, 1:] - k * np.outer(mean, mean)) * (k - 1.0) / k)
+        return (self.steps[1:, 1:] - k * np.outer(mean, mean)) * (k - 1.0) / k
 
     @property
     def clustered(self) -> tuple[FloatArray, FloatArray, FloatArray]:

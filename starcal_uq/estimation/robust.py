@@ -111,7 +111,7 @@ def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
 
 def in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
     """Stars (N,), kept or not, of frames that keep three or more."""
-    return np.asarray(frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0)
+    return frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0
 
 
 def robust_start(

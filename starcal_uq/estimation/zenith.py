@@ -145,7 +145,7 @@ class Images:
 def orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
     """Directions (r, m) of rows (g, m) whose squares are above `least` of the rows'."""
     values, vectors = principal(rows @ rows.T, least)
-    return np.asarray((vectors / np.sqrt(values)).T @ rows)
+    return (vectors / np.sqrt(values)).T @ rows
 
 
 class Settled(NamedTuple):

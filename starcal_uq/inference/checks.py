@@ -133,11 +133,7 @@ def check_compression(
         arguments = target.arguments(np.concatenate([mode, points]))
         found = exact(*arguments) - compressed(*arguments)
         # Of other stars than those of the calibration the exact one may be nothing.
-        return (
-            np.asarray(found[1:] - found[0])
-            if np.isfinite(found).all()
-            else np.full(len(points), np.inf)
-        )
+        return found[1:] - found[0] if np.isfinite(found).all() else np.full(len(points), np.inf)
 
     def known(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Differences (n,) and what they may be larger by."""

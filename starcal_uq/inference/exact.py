@@ -117,7 +117,7 @@ class FrameSample:
             np.bincount(self._batch, self._exact.by_frame(point, float(noise)))
             for point, noise in zip(theta, sigma, strict=True)
         ]
-        return np.asarray((np.transpose(exact) - expanded) * self._stand_for[:, None])
+        return (np.transpose(exact) - expanded) * self._stand_for[:, None]
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """The compressed log likelihood of all frames, and what it leaves out (n,)."""

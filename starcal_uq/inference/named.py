@@ -177,7 +177,7 @@ def _widened(source: Source, factors: FloatArray) -> Source:
     """
 
     def at(theta: FloatArray) -> FloatArray:
-        return np.asarray(source.theta + (theta - source.theta) / factors)
+        return source.theta + (theta - source.theta) / factors
 
     def wider(log_likelihood: LogLikelihood) -> LogLikelihood:
         return lambda theta, *rest: log_likelihood(at(theta), *rest)
@@ -282,7 +282,7 @@ def _scales_integrated(cal: Calibration, exact: LogLikelihood) -> LogLikelihood:
 
     def integrated(theta: FloatArray, sigma: FloatArray) -> FloatArray:
         best = cal.compressed.log_likelihood(theta, sigma)
-        return np.asarray(exact(theta, sigma) + cal.log_likelihood(theta, sigma) - best)
+        return exact(theta, sigma) + cal.log_likelihood(theta, sigma) - best
 
     return integrated
 

@@ -329,7 +329,7 @@ class Posterior(Shown, Traced):
     def covariance(self) -> FloatArray:
         """Posterior covariance (p, p) of the camera parameters."""
         shift = self.theta_draws - self.mean
-        return np.asarray(shift.T @ shift / (len(shift) - 1))
+        return shift.T @ shift / (len(shift) - 1)
 
     @cached_property
     def sd(self) -> FloatArray:

@@ -136,7 +136,7 @@ class Priors(Shown, ABC):
         known = parameter_names(self.distortion)
         rows = [known.index(name) for name in names]
         correlation = self._correlation()[np.ix_(rows, rows)]
-        return np.asarray(np.linalg.inv(correlation) / np.outer(sd, sd))
+        return np.linalg.inv(correlation) / np.outer(sd, sd)
 
     def _correlation(self) -> FloatArray:
         return correlation_of(self.theta_moments()[1])[0]
@@ -183,9 +183,7 @@ class Priors(Shown, ABC):
             density = np.exp(self.log_density_log_sigma(np.log(positive))) / positive
             return np.where(values > 0.0, density, 0.0)
         mean, sd = self._moments_of(name)
-        return np.asarray(
-            np.exp(-0.5 * ((values - mean) / sd) ** 2) / (sd * math.sqrt(2.0 * math.pi))
-        )
+        return np.exp(-0.5 * ((values - mean) / sd) ** 2) / (sd * math.sqrt(2.0 * math.pi))
 
     def _moments_of(self, name: str) -> tuple[float, float]:
         """Mean and standard deviation of one parameter."""

@@ -178,7 +178,7 @@ def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
 
 def _outer(factor: FloatArray) -> FloatArray:
     product = factor @ factor.T
-    return np.asarray(0.5 * (product + product.T))
+    return 0.5 * (product + product.T)
 
 
 def curvature(target: Target) -> FloatArray:
@@ -211,13 +211,13 @@ def _derivatives(density: Density, d: int) -> tuple[float, FloatArray, FloatArra
 def _inverse_square_root(curvature: FloatArray) -> FloatArray:
     """S with S S^T = curvature^-1; directions that are not concave keep their present length."""
     values, vectors = np.linalg.eigh(curvature)
-    return np.asarray(vectors / np.sqrt(np.where(values > 1e-3, values, 1.0)))
+    return vectors / np.sqrt(np.where(values > 1e-3, values, 1.0))
 
 
 def _shorten(target: Target, step: FloatArray, value: float) -> FloatArray:
     trials = 0.5 ** np.arange(12)[:, None] * step
     better = np.flatnonzero(target.log_density(trials) >= value)
-    return np.asarray(trials[better[0]] if len(better) else np.zeros_like(step))
+    return trials[better[0]] if len(better) else np.zeros_like(step)
 
 
 def student_t_log_density(u: FloatArray, df: float) -> FloatArray:

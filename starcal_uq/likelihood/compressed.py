@@ -306,11 +306,11 @@ def combined(
         [w @ ((t - theta[0]) / scale) for w, t in zip(precision, theta, strict=True)], axis=0
     )
     mean = theta[0] + scale * (reduced @ shift)
-    return np.asarray(mean), np.asarray(0.5 * (reduced + reduced.T) * outer)
+    return mean, 0.5 * (reduced + reduced.T) * outer
 
 
 def _covariance(compressed: CompressedLikelihood) -> FloatArray:
-    return np.asarray(compressed.whitening @ compressed.whitening.T)
+    return compressed.whitening @ compressed.whitening.T
 
 
 @dataclasses.dataclass(frozen=True)
@@ -390,7 +390,7 @@ def unit_covariance(compressed: CompressedLikelihood) -> FloatArray:
     p = len(compressed.theta_hat)
     unit = np.linalg.inv(compressed.gram[1 : p + 1, 1 : p + 1])
     root = compressed.whitening @ np.linalg.cholesky(0.5 * (unit + unit.T))
-    return np.asarray(root @ root.T)
+    return root @ root.T
 
 
 def settled(compressed: CompressedLikelihood) -> CompressedLikelihood:

@@ -78,7 +78,7 @@ class EffectLikelihood(MarginalLikelihood):
         own += np.einsum("ncq,cxn->qxn", found.frame[member], self.columns.frame, optimize=True)
         if self.columns.n_stars:
             own += self.project_out(state, self._of_stars(found))
-        return np.asarray(own)
+        return own
 
     def _of_stars(self, found: Cross) -> FloatArray:
         by_image = found.star.reshape(self.columns.n_stars, 2, -1)[self.columns.groups]
@@ -92,7 +92,7 @@ class EffectLikelihood(MarginalLikelihood):
         own += np.einsum("kcq,cik->qik", found.frame, self.columns.frame_turns)
         if self.columns.n_stars:
             own += self.attitude_response(state, self._of_stars(found))
-        return np.asarray(own)
+        return own
 
     def random_shifts(self, state: Profile, rng: np.random.Generator) -> FloatArray:
         """Whitened shifts (1, 2, N) of all images by random coefficients, in units of sigma."""

@@ -438,20 +438,20 @@ class Solved:
         sigma squared.
         """
         half = np.linalg.solve(self.run_factor, np.diag(self.run_root))
-        return np.asarray(half.T @ half)
+        return half.T @ half
 
     @property
     def of_run(self) -> FloatArray:
         """Best coefficients (m, q) of the run for the added columns."""
         root = self.run_root[:, None]
         half = np.linalg.solve(self.run_factor, root * self.cross)
-        return np.asarray(root * np.linalg.solve(self.run_factor.T, half))
+        return root * np.linalg.solve(self.run_factor.T, half)
 
     @cached_property
     def gram(self) -> FloatArray:
         """Products (q, q) of the added columns with W."""
         left = np.linalg.solve(self.run_factor, self.run_root[:, None] * self.cross)
-        return np.asarray(self.outer - left.T @ left)
+        return self.outer - left.T @ left
 
     @property
     def log_determinant(self) -> float:
@@ -474,7 +474,7 @@ class Solved:
         if self.stars is not None:
             star = star - self.stars.found @ run
             half = half - (self.stars.also.T @ star).reshape(half.shape)
-        return Cross(run, np.asarray(self.frame_vectors @ (root * half)), star)
+        return Cross(run, self.frame_vectors @ (root * half), star)
 
 
 def expected(effects: Sequence[Effect], present: Mapping[str, Any]) -> FloatArray:

@@ -181,7 +181,7 @@ def _moving(against: str, weights: FloatArray) -> Shape:
     def columns(view: View) -> FloatArray:
         moving = view.parameter_columns[:3]
         found = weights[:, None, None, view.rows] * moving
-        return np.asarray(found.reshape(-1, *moving.shape[1:]))
+        return found.reshape(-1, *moving.shape[1:])
 
     return Shape(f"change of x0, y0 and f with {against}", against, 3 * len(weights), columns)
 
@@ -271,7 +271,7 @@ def _of_camera(
     flat = held.reshape(len(held), -1)
     unit = np.linalg.norm(flat, axis=1)
     taken = np.linalg.lstsq((flat / unit[:, None]).T, raw(xy).reshape(-1, flat.shape[1]).T)[0]
-    return unit, np.asarray(taken)
+    return unit, taken
 
 
 def pixels_of(camera: Camera, xy: FloatArray) -> View:

@@ -154,7 +154,7 @@ class NoiseModel:
                 self.frame_ids[place] == obs.frame, self.frame_factors[place], self.frame_mean
             )
             sigma = sigma * np.sqrt(own / self.frame_mean)
-        return sigma if stated is None or not self.multiplies else np.asarray(sigma * stated)
+        return sigma if stated is None or not self.multiplies else sigma * stated
 
     def record(self, frames: bool = True) -> AnyDict:
         """The model as plain values, for a provenance, with or without the factors of frames."""

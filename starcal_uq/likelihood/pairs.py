@@ -61,7 +61,7 @@ class PairObjective:
         if self._turned_at is None:
             return None
         x, y = (theta[:2] - self._turned_at[:2]) / theta[2]
-        return np.asarray(exp_rotation(np.array([y, -x, 0.0])) @ self._rotations)
+        return exp_rotation(np.array([y, -x, 0.0])) @ self._rotations
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""

@@ -66,7 +66,7 @@ class View:
     @property
     def predicted(self) -> FloatArray:
         """Predicted positions (2, n), px."""
-        return np.asarray(self.part.frames.pixel - self.part.frames.in_pixels(self.state.e))
+        return self.part.frames.pixel - self.part.frames.in_pixels(self.state.e)
 
     @cached_property
     def uv(self) -> FloatArray:
@@ -439,7 +439,7 @@ def outwards(uv: FloatArray, size: int) -> FloatArray:
     from numpy.polynomial.chebyshev import chebvander
 
     powers = chebvander(2.0 * np.hypot(*uv) - 1.0, size - 1).T
-    return np.asarray(powers[:, None] * uv)
+    return powers[:, None] * uv
 
 
 def _radius(camera: Camera) -> Shape:

@@ -76,7 +76,7 @@ def log_excess_prior(log_excess: FloatArray) -> FloatArray:
     """Log prior density of log(nu - 2), where nu - 2 is gamma: shape 2, rate 0.1 (after Juarez &
     Steel 2010).
     """
-    return np.asarray(2.0 * log_excess - 0.1 * np.exp(log_excess))
+    return 2.0 * log_excess - 0.1 * np.exp(log_excess)
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class Attitudes:
     def at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta (p,), to first order."""
         step = self.shift + np.einsum("ipk,p->ik", self.response, theta - self.theta)
-        return np.asarray(exp_rotation(step.T) @ self.rotations)
+        return exp_rotation(step.T) @ self.rotations
 
 
 def frame_sums(

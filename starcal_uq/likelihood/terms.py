@@ -160,7 +160,7 @@ def factor(matrix: Any, name: str, option: str) -> tuple[Callable[[FloatArray], 
     if density > _FULL:
         dense = cho_factor(matrix.toarray(), lower=True, overwrite_a=True, check_finite=False)
         volume = 2.0 * float(np.sum(np.log(np.diag(dense[0]))))
-        return lambda columns: np.asarray(cho_solve(dense, columns, check_finite=False)), volume
+        return lambda columns: cho_solve(dense, columns, check_finite=False), volume
     sparse = splu(
         matrix.tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -168,7 +168,7 @@ def factor(matrix: Any, name: str, option: str) -> tuple[Callable[[FloatArray], 
         options={"SymmetricMode": True},
     )
     volume = float(np.sum(np.log(np.abs(sparse.U.diagonal()))))
-    return lambda columns: np.asarray(sparse.solve(np.asfortranarray(columns))), volume
+    return lambda columns: sparse.solve(np.asfortranarray(columns)), volume
 
 
 class Eliminated:
@@ -218,4 +218,4 @@ class Eliminated:
         sums = self._sums
         precision = (1.0 / self.ratio).reshape(-1, _SIZE, 1) * np.eye(_SIZE)
         inverse = np.linalg.inv(sums.own + precision)
-        return np.asarray(np.diagonal(inverse, axis1=1, axis2=2)).ravel()
+        return np.diagonal(inverse, axis1=1, axis2=2).ravel()

@@ -285,9 +285,7 @@ def even_noise(found: Misfit, helping: Remedies = ()) -> Check:
 
 def disagreeing(found: Jackknife) -> BoolArray:
     """Parameters (p,) in which frames scatter by more than chance and by enough to matter."""
-    return np.asarray(
-        (found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
-    )
+    return (found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
 
 
 def jackknife(found: Jackknife, moving: Remedies = ()) -> Check:
