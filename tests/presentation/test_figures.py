@@ -9,6 +9,7 @@ import dataclasses
 import itertools
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.camera.distortion import parameters
+from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.coupling import (
     correlation_text,
     plot_correlation,
@@ -341,3 +343,14 @@ def test_every_figure_is_drawn_into_that_of_the_user(monkeypatch, tmp_path):
             assert not pyplot.get_fignums(), name
             n_drawn += 1
     assert n_drawn > 60
+
+
+def test_every_name_of_the_table_of_looks_is_found_and_used():
+    """A legend names looks that exist, and nothing in the table is left over."""
+    table = tomllib.loads((ROOT / "starcal_uq/presentation/figures/looks.toml").read_text("utf-8"))
+    drawn = [one for legend in table["legends"] for one in style.keys(legend)]
+    assert all(one.get_label() for one in drawn) and len(drawn) > 10
+    code = "".join(path.read_text("utf-8") for path in (ROOT / "starcal_uq").rglob("*.py"))
+    words = {name for legend in table["legends"].values() for name in legend.values()}
+    left = {name for name in table["looks"] if f'"{name}"' not in code} - words
+    assert not left, left

@@ -10,7 +10,10 @@ from __future__ import annotations
 import io
 import re
 import sys
+import tomllib
+from collections.abc import Iterable
 from functools import cache
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -32,6 +35,9 @@ if TYPE_CHECKING:
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILLION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 INK, GREY, LIGHT = "#1b2733", "#66727f", "#dfe4e9"
+_COLOURS = {
+    name.lower(): colour for name, colour in globals().items() if str(colour).startswith("#")
+}
 
 TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 10.5, 9.5, 8.5
 # Half as many again as a page of 1100 px shows.
@@ -207,6 +213,53 @@ def label(
         ax.set_xlabel(x, fontsize=size, color=INK)
     if y:
         ax.set_ylabel(y, fontsize=size, color=INK)
+
+
+@cache
+def _table() -> AnyDict:
+    return tomllib.loads((files(__package__ or "") / "looks.toml").read_text("utf-8"))
+
+
+def look(name: str, **more: Any) -> AnyDict:
+    """Colour, marker and line by a name in ``looks.toml``."""
+    found = {key: _COLOURS.get(str(one), one) for key, one in _table()["looks"][name].items()}
+    return found | more
+
+
+def named(ax: Axes, name: str, **look: Any) -> None:
+    """Title and axis labels by a name in ``looks.toml``."""
+    label(ax, **_table()["labels"][name], **look)
+
+
+def keys(name: str) -> list[Any]:
+    """Entries of a legend by its name in ``looks.toml``."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    found = {text: look(one) for text, one in _table()["legends"][name].items()}
+    return [
+        Patch(label=text, **one) if "facecolor" in one else Line2D([], [], label=text, **one)
+        for text, one in found.items()
+    ]
+
+
+def errors(
+    ax: Axes, at: Any, value: Any, low: Any, high: Any, *, across: bool = False, **look: Any
+) -> None:
+    """Values with bars from their lower to their upper bounds, along x with `across`."""
+    bars = np.maximum([value - low, high - value], 0.0)
+    if across:
+        ax.errorbar(value, at, xerr=bars, **look)
+    else:
+        ax.errorbar(at, value, bars, **look)
+
+
+def rows(ax: Axes, names: Iterable[str]) -> None:
+    """Names of the rows of a panel at 0, 1, ..., from below, without ticks."""
+    names = list(names)
+    ax.set_yticks(range(len(names)), names)
+    ax.tick_params(axis="y", length=0.0)
+    ax.set_ylim(-0.65, len(names) - 0.35)
 
 
 def heading(ax: Axes, text: str, size: float = TITLE_SIZE, pad: float = 5.0) -> None:
