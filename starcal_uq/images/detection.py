@@ -172,11 +172,11 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     threshold = np.float32(options.threshold_sigma * left)
     filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
     # Whatever is found is among these, rounding included.
-    n_above = np.count_nonzero(filtered > np.float32(0.9999) * threshold * frame.noise.min())
+    above = np.flatnonzero(filtered > np.float32(0.9999) * threshold * frame.noise.min())
     # sep prepares a list for all pixels that it may have to keep, which takes longer than a small
     # image.
     most = sep.get_extract_pixstack()
-    sep.set_extract_pixstack(min(most, n_above + _PIXELS_MORE, filtered.size + _PIXELS_MORE))
+    sep.set_extract_pixstack(min(most, len(above) + _PIXELS_MORE))
     try:
         objects, labels = sep.extract(
             filtered,
@@ -194,29 +194,34 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
         ) from error
     finally:
         sep.set_extract_pixstack(most)
-    labels = labels.ravel()
-    inside = np.flatnonzero(labels)
     objects["flux"] = np.bincount(
-        labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1
+        labels.ravel()[above], frame.counts.ravel()[above], minlength=len(objects) + 1
     )[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
 
 
 def _filtered(counts: Any, line: Any) -> Any:
-    """Counts filtered by the product of a `line` with itself, dark beyond the edges.
+    """Counts filtered by the product of a symmetric `line` with itself, dark beyond the edges.
 
-    Blocks of rows stay in the processor's cache, where sums of shifted rows take half the time of
-    SciPy's filter, which goes line by line in double precision.
+    Blocks of rows stay in the processor's cache, where sums of shifted rows take a third of the
+    time of SciPy's filter, which goes line by line in double precision.
     """
-    more = len(line) - 1
+    half = len(line) // 2
 
     def along(rows: Any) -> Any:
-        return sum(weight * rows[k : len(rows) - more + k] for k, weight in enumerate(line))
+        n = len(rows) - 2 * half
+        total = line[half] * rows[half : half + n]
+        pair = np.empty_like(total)
+        for k in range(half):
+            np.add(rows[k : k + n], rows[2 * half - k :][:n], out=pair)
+            pair *= line[k]
+            total += pair
+        return total
 
-    padded, size = np.pad(counts, more // 2), _ROWS_AT_ONCE
+    padded, size = np.pad(counts, half), _ROWS_AT_ONCE
     tops = range(0, len(counts), size)
-    return np.concatenate([along(along(padded[k : k + size + more]).T).T for k in tops])
+    return np.concatenate([along(along(padded[k : k + size + 2 * half]).T).T for k in tops])
 
 
 def _mosaic_noise(line: Any) -> float:
