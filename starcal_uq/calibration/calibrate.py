@@ -238,9 +238,9 @@ def _with_axes_of_camera(
     is two parameters of the camera.
     """
     found = estimate(camera, settings)
-    held = found.effects
-    taken = [] if held is None else [e for e in held.fitted if e.name == "axes"]
-    if held is None or not taken:
+    held = found.known_effects
+    taken = [e for e in held.fitted if e.name == "axes"]
+    if not taken:
         return found
     free = camera.replace(distortion=with_axes(camera.distortion))
     try:
@@ -323,14 +323,11 @@ def _selected(obs: Observations, cal: Calibration, settings: EstimationSettings)
             break
         more = settings.changed(effects=[*settings.names, best])
         trial = _refitted(obs, cal, more)
-        if trial is None or trial.effects is None:
+        if trial is None:
             break
-        gained = {one.name: one.gain_nat for one in trial.effects.weighing}
-        weak = [
-            name
-            for name in gained
-            if name not in asked and gained[name] <= trial.effects.penalty_nat
-        ]
+        held = trial.known_effects
+        gained = {one.name: one.gain_nat for one in held.weighing}
+        weak = [n for n in gained if n not in asked and gained[n] <= held.penalty_nat]
         if best in weak:
             left |= {best: gained[best]}
             break
@@ -341,10 +338,10 @@ def _selected(obs: Observations, cal: Calibration, settings: EstimationSettings)
         worst = int(np.argmax(sizes))
         moved[best] = {"moved_sigma": float(sizes[worst]), "moved_name": cal.parameter_names[worst]}
         found, settings = trial, more
-    assert found.effects is not None
-    refused = sorted((*found.effects.refused, *left.items()), key=lambda one: -one[1])
-    weighing = [replace(one, **moved.get(one.name, {})) for one in found.effects.weighing]
-    held = replace(found.effects, weighing=tuple(weighing), refused=tuple(refused), asked=asked)
+    held = found.known_effects
+    refused = sorted((*held.refused, *left.items()), key=lambda one: -one[1])
+    weighing = [replace(one, **moved.get(one.name, {})) for one in held.weighing]
+    held = replace(held, weighing=tuple(weighing), refused=tuple(refused), asked=asked)
     return replace(found, effects=held)
 
 
@@ -369,8 +366,7 @@ def _gained(
     What effects of few images leave is uneven by itself: beside the others noise and tails have to
     gain more than these.
     """
-    assert cal.effects is not None
-    fitted, least = cal.effects.fitted, cal.effects.penalty_nat
+    fitted, least = cal.known_effects.fitted, cal.known_effects.penalty_nat
     few = [one.gain_nat for one in fitted if one.name in _OF_FEW_IMAGES]
     shared = [one.name for one in fitted if one.name not in _OF_FEW_IMAGES]
     gained = gains(obs, cal, settings.noise, settings.tails)
@@ -385,7 +381,7 @@ def _gained(
 def _with_all(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
     """The calibration with effects that shift stars; others are found again beside these."""
     found = _with_shifts(obs, obs, cal, settings)
-    if found.effects and found.effects.fitted and (settings.noise or settings.tails):
+    if found.known_effects.fitted and (settings.noise or settings.tails):
         # Noise and tails of a camera without its effects hold these, too.
         again = fit_weighed(without_effects(obs, found), cal.nominal, settings)
         if again.status.ok:

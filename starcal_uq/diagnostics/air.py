@@ -26,7 +26,6 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import (
     FRAMES,
     StarNoise,
-    has_effects,
     images_beside,
     without_effects,
 )
@@ -161,7 +160,7 @@ def air_test(
 def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> StarNoise | None:
     """Direction errors that recurring stars show."""
     # Effects hold what stars bring along, where the data support that.
-    if not found.tau_px > 0.0 or has_effects(cal):
+    if not found.tau_px > 0.0 or cal.known_effects.fitted:
         return None
     own = float(np.sqrt(own_noise(obs, cal.sigma**2, found.tau_px**2)))
     return StarNoise(found.tau_px, own, found.n_recurring)
@@ -217,7 +216,7 @@ class _Air:
         likelihood, state = images.likelihood, images.state
         shifts, _, taken = self._taken(self.seen_px)
         left = shifts[0] - np.tensordot(taken, state.slopes, 1)
-        if has_effects(self._cal) and isinstance(likelihood, EffectLikelihood):
+        if self._cal.known_effects.fitted and isinstance(likelihood, EffectLikelihood):
             # Effects have taken their part of it off the images already.
             left = likelihood.conditioned(state, left[None])[0][0]
         x, y = likelihood.frames.in_pixels(left)

@@ -20,7 +20,7 @@ from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.zenith import Images, orthonormal
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.effect_sums import Columns
-from starcal_uq.likelihood.effects import Effect, effects_of, star_effect
+from starcal_uq.likelihood.effects import effects_of, star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
@@ -39,16 +39,6 @@ _ABSORBED = 1e-8
 _STARS_AT_ONCE = 10_000
 
 
-def has_effects(cal: Calibration) -> bool:
-    """Whether a calibration holds effects that shift stars."""
-    return cal.effects is not None and bool(cal.effects.fitted)
-
-
-def effects_beside(obs: Observations, cal: Calibration) -> list[Effect]:
-    """Effects of a calibration, in the order of its coefficients; none where it has none."""
-    return [] if cal.effects is None else cal.effects.of(obs, cal.camera)
-
-
 def with_effects_of(
     obs: Observations, cal: Calibration, rotations: FloatArray, whole: Observations
 ) -> EffectLikelihood:
@@ -57,9 +47,7 @@ def with_effects_of(
 
     Frames that are not all of the table lack effects of nights.
     """
-    assert cal.effects is not None
-    seen = None if obs.n_frames == whole.n_frames else obs
-    held = cal.effects
+    seen, held = None if obs.n_frames == whole.n_frames else obs, cal.known_effects
     known = effects_of(whole, cal.camera, seen=seen, zeniths=held.zeniths, extent=held.extent)
     found = [known[own.name] for own in held.fitted if own.name in known]
     frames = StarFrames.from_observations(obs)
@@ -96,7 +84,7 @@ def images_beside(
         frames = StarFrames.from_observations(some)
         at = (cal.theta, rotations, errors.sigma)
         likelihood = EffectLikelihood(frames, model, [stars], ratio, *at)
-    elif has_effects(cal):
+    elif cal.known_effects.fitted:
         likelihood = with_effects_of(some, cal, rotations, obs)
     return Images(some, cal, rotations, likelihood)
 
@@ -105,7 +93,7 @@ def without_effects(obs: Observations, cal: Calibration) -> Observations:
     """The table with its images where they would be without the effects of the calibration, as far
     as these are known; itself where there are none.
     """
-    return effects.without_effects(obs, cal) if has_effects(cal) else obs
+    return effects.without_effects(obs, cal) if cal.known_effects.fitted else obs
 
 
 def normals_beside(obs: Observations, cal: Calibration) -> FrameNormals:
@@ -148,7 +136,7 @@ class Freed:
 
         `gram` (p + 1, p + 1): products of parameters and residuals, attitudes removed.
         """
-        if has_effects(cal):
+        if cal.known_effects.fitted:
             yield cls.of(obs, cal)
             return
         inner, unit = gram[:-1, :-1], 1.0 / np.sqrt(np.diag(gram)[:-1])
@@ -172,7 +160,7 @@ class Freed:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         state, _ = likelihood.profile(cal.theta, rotations)
         frames, e = likelihood.frames, state.e
-        held = effects_beside(obs, cal)
+        held = cal.known_effects.of(obs, cal.camera)
         if any(effect.grouping == "star" for effect in held):
             exact = with_effects_of(obs, cal, rotations, obs)
             _, found = exact.conditioned(state, e[None])

@@ -26,7 +26,7 @@ from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
-from starcal_uq.diagnostics.beside import has_effects, without_effects
+from starcal_uq.diagnostics.beside import without_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
 from starcal_uq.diagnostics.models import ModelComparison, compare_models
@@ -236,7 +236,7 @@ def extended(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[Exten
     bent = any(not test.is_of_noise for test in found)
     if of_files is not None and of_files.level is not Level.PASS:
         bent = True
-    looked = has_effects(cal) or (cal.effects is not None and cal.effects.selected)
+    looked = cal.known_effects.fitted or cal.known_effects.selected
     if looked or not (found or bent):
         return None, True
     if cal.method != "efficient" or cal.partitions is not None:
@@ -245,9 +245,9 @@ def extended(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[Exten
         made = with_effects(*of_heard(obs, cal))
     except StarcalError:
         return None, not bent
-    if made.effects is None or not made.effects.fitted:
+    if not made.known_effects.fitted:
         return None, True
-    effects = made.effects.about(made.compressed, np.zeros(len(made.theta)), made.covariance)
+    effects = made.known_effects.about(made.compressed, np.zeros(len(made.theta)), made.covariance)
     return Extended(made.camera, made.covariance, effects, made.provenance), True
 
 
@@ -294,17 +294,16 @@ def diagnose(
     # What stars say of their model they say without rotations that others measured.
     cal = whole = without_ties(obs, cal)
     if obs.n_frames < whole.n_frames and whole.partitions is not None:
-        effects = whole.effects.names if whole.effects is not None else ()
-        model = whole.nominal.model
+        effects, model = whole.known_effects.names, whole.nominal.model
         cal = calibrate(obs, whole.nominal, model=model, effects=effects, duplicates="keep")
     # Two tests leave frames out.
-    normals = None if has_effects(cal) else FrameNormals.at(obs, cal)
+    normals = None if cal.known_effects.fitted else FrameNormals.at(obs, cal)
     found = jackknife_of_all(whole) or _jackknife(obs, cal, normals)
     step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)
     step(2, 4)
     # A single frame cannot be left out, and a field holds what other models would add to the lens.
-    asked = obs.n_frames > 1 and not (cal.effects is not None and "field" in cal.effects.names)
+    asked = obs.n_frames > 1 and "field" not in cal.known_effects.names
     comparison = None
     if models and asked:
         comparison = compare_models(obs, cal, models, seed=seed, normals=normals)
@@ -354,7 +353,7 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     reference, lowest = cal.theta, cal.chi2
     # Tails beside a noise model are estimated in turns, which end a little beside this optimum.
     robust = cal.provenance.likelihood != "marginal"
-    if some is not obs or robust or has_effects(cal):
+    if some is not obs or robust or cal.known_effects.fitted:
         try:
             optimum, found = _optimum(some, cal, cal.camera)
         except StarcalError:
@@ -403,7 +402,7 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
         )
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
-    if has_effects(cal):
+    if cal.known_effects.fitted:
         return found.theta, found.chi2
     # The last, small step of a calibration, which is the same for all that end in its optimum.
     step = (

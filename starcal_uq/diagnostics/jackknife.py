@@ -17,7 +17,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import FloatArray, Shapes, floats
-from starcal_uq.diagnostics.beside import has_effects, normals_beside
+from starcal_uq.diagnostics.beside import normals_beside
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
 
@@ -193,7 +193,7 @@ def jackknife_frames(
             f"a jackknife over {plural(obs.n_frames, 'frame')} says nothing: use three or more."
         )
     if normals is None:
-        at = normals_beside if has_effects(cal) else FrameNormals.at
+        at = normals_beside if cal.known_effects.fitted else FrameNormals.at
         normals = at(weighed(obs, cal), cal)
     z, _ = normals.left_out()
     if not np.isfinite(z).all():

@@ -23,7 +23,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.diagnostics.beside import Freed, has_effects, without_effects
+from starcal_uq.diagnostics.beside import Freed, without_effects
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF, MisfitTest
 from starcal_uq.diagnostics.noise_tests import NoiseSums, noise_weights
 from starcal_uq.diagnostics.residuals import of_heard
@@ -146,7 +146,10 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     gram, weights = sums.gram[: sums.p + 1, : sums.p + 1], noise_weights(obs, cal.camera)
-    noise, of_noise = NoiseSums(Freed.pieces(obs, cal, gram), weights, has_effects(cal)), []
+    noise, of_noise = (
+        NoiseSums(Freed.pieces(obs, cal, gram), weights, bool(cal.known_effects.fitted)),
+        [],
+    )
     if noise.dof >= LEAST_DOF:
         of_noise = [(f"noise that changes with {name}", name, z, p) for name, z, p in noise.tests()]
     if (frames := noise.by_frame()) is not None:

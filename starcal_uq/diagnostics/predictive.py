@@ -16,7 +16,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, floats
-from starcal_uq.diagnostics.beside import has_effects, with_effects_of
+from starcal_uq.diagnostics.beside import with_effects_of
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -128,7 +128,7 @@ def predictive_check(
     state, _ = part.profile(cal.theta, cal.rotations[places])
     e, h = state.e, state.slopes
     exact: EffectLikelihood | None = None
-    if has_effects(cal):
+    if cal.known_effects.fitted:
         exact = with_effects_of(some, cal, state.rotations, used)
         # Its images are less what effects are expected to do.
         state, _ = exact.profile(cal.theta, exact.rotations)

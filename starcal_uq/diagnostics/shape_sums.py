@@ -11,7 +11,6 @@ import numpy as np
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import (
     by_frame,
-    effects_beside,
 )
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF, Amplitude, MisfitTest
 from starcal_uq.likelihood.effect_sums import EffectSums, Solved
@@ -49,7 +48,7 @@ class ShapeSums:
 
     def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-        p, theta, effects = len(cal.theta), cal.theta, effects_beside(obs, cal)
+        p, theta, effects = len(cal.theta), cal.theta, cal.known_effects.of(obs, cal.camera)
         self.p, self.dof = p, likelihood.dof - p
         self.names, self.n_stars = cal.parameter_names, obs.n_stars
         self.noise_px = float(np.sqrt(np.mean(obs.sigma_or_one**2)))
@@ -71,7 +70,7 @@ class ShapeSums:
                 square += float(np.sum(own**2))
         # Squares of the columns before attitudes are removed
         self.raw = sums.total.squares
-        ratio = {} if cal.effects is None else cal.effects.ratio(cal.sigma)
+        ratio = cal.known_effects.ratio(cal.sigma)
         # Products of parameters, residuals and columns of effects and of all families, attitudes
         # removed, and what they would be without effects, where there are any.
         self.gram = _without_effects(sums.solved(ratio))

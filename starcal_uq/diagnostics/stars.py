@@ -182,8 +182,7 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
 
 def _included(cal: Calibration) -> tuple[float, float]:
     """Error of the stars that a calibration has marginalised, and its standard error, px."""
-    fitted = () if cal.effects is None else cal.effects.fitted
-    own = next((effect for effect in fitted if effect.name == "star"), None)
+    own = next((effect for effect in cal.known_effects.fitted if effect.name == "star"), None)
     if own is None:
         return 0.0, 0.0
     # The interval is that of the logarithm.

@@ -81,9 +81,6 @@ def effect_curves(cal: Calibration, obs: Observations) -> list[EffectCurve]:
     """Curves of the effects of a calibration of this table, in the order in which they were taken
     up; none of effects that are maps of the field.
     """
-    found = cal.effects
-    if found is None:
-        return []
     made = {
         "temperature": _temperature,
         "time": _time,
@@ -93,23 +90,25 @@ def effect_curves(cal: Calibration, obs: Observations) -> list[EffectCurve]:
         "frame": _frames,
         "star": _stars,
     }
-    return [curve for name in found.names if name in made for curve in made[name](cal, obs)]
+    return [
+        curve for name in cal.known_effects.names if name in made for curve in made[name](cal, obs)
+    ]
 
 
 def _linear(
     cal: Calibration, effect: str, against: str, x: FloatArray, design: FloatArray
 ) -> EffectCurve:
     """The curve of the optics by a design (3, n, m) of the effect's coefficients."""
-    assert cal.effects is not None
-    at = cal.effects.at(effect)
-    spread = np.einsum("qnm,mk,qnk->qn", design, cal.effects.covariance[at, at], design)
-    values = design @ cal.effects.coefficients[at]
+    effects = cal.known_effects
+    at = effects.at(effect)
+    spread = np.einsum("qnm,mk,qnk->qn", design, effects.covariance[at, at], design)
+    values = design @ effects.coefficients[at]
     return EffectCurve(effect, against, _OPTICS, x, values, np.sqrt(spread))
 
 
 def _temperature(cal: Calibration, obs: Observations) -> list[EffectCurve]:
-    assert cal.effects is not None and obs.temperature_c is not None
-    mean, spread = cal.effects.temperature_c
+    assert obs.temperature_c is not None
+    mean, spread = cal.known_effects.temperature_c
     x = np.linspace(np.nanmin(obs.temperature_c), np.nanmax(obs.temperature_c), _POINTS)
     design = np.einsum("n,qm->qnm", (x - mean) / spread, np.eye(3))
     return [_linear(cal, "temperature", "temperature [°C]", x, design)]
@@ -137,8 +136,7 @@ def _when(obs: Observations) -> tuple[FloatArray, str]:
 
 
 def _nights(cal: Calibration, obs: Observations) -> list[EffectCurve]:
-    assert cal.effects is not None
-    n = len(cal.effects.coefficients[cal.effects.at("epoch")]) // 3
+    n = dict(cal.known_effects.places)["epoch"] // 3
     design = np.eye(3 * n).reshape(n, 3, 3 * n).swapaxes(0, 1)
     curve = _linear(cal, "epoch", "night", np.arange(1.0, n + 1.0), design)
     return [replace(curve, joined=False)]
@@ -163,8 +161,8 @@ def _magnitude(cal: Calibration, obs: Observations) -> list[EffectCurve]:
 
 
 def _frames(cal: Calibration, obs: Observations) -> list[EffectCurve]:
-    found = cal.effects
-    if found is None or len(found.frames) != obs.n_frames:
+    found = cal.known_effects
+    if len(found.frames) != obs.n_frames:
         return []
     x, against = _when(obs)
     names = ("scale", "stretch along x", "shear")
@@ -173,10 +171,7 @@ def _frames(cal: Calibration, obs: Observations) -> list[EffectCurve]:
 
 
 def _stars(cal: Calibration, obs: Observations) -> list[EffectCurve]:
-    found = cal.effects
-    if found is None:
-        return []
-    model = StarModel(obs, float(cal.camera.focal_px))
+    found, model = cal.known_effects, StarModel(obs, float(cal.camera.focal_px))
     if len(found.stars) != len(model.images):
         return []
     x, against = model.images.astype(np.float64), "images of the star"
@@ -192,8 +187,8 @@ def found_zeniths(cal: Calibration, true_zeniths: FloatArray | None = None) -> F
     """Zeniths that the effect of air found, on the sky; `true_zeniths` (K, 3) are those of the
     site, ICRS axes. None without that effect.
     """
-    found = cal.effects
-    if found is None or found.zeniths is None:
+    found = cal.known_effects
+    if found.zeniths is None:
         return None
     rotations = cal.rotations
     boresights = rotations[np.searchsorted(cal.frame_ids, found.zeniths.frame_ids), 2]

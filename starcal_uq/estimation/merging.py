@@ -286,8 +286,8 @@ def check_mergeable(
                 "form: calibrate it with the marginal likelihood, or calibrate all observations "
                 "together."
             )
-        if cal.effects is not None and cal.effects.fitted:
-            held = ", ".join(effect.name for effect in cal.effects.fitted)
+        if fitted := cal.known_effects.fitted:
+            held = ", ".join(effect.name for effect in fitted)
             raise CalibrationError(
                 f"{name}: holds effects ({held}), whose scales and coefficients all runs share, "
                 "and its likelihood has integrated them: calibrate the observations of all runs "

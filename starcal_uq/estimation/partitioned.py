@@ -335,8 +335,9 @@ def calibrate_partitions(
         n = dof + len(first)
         stars = FileStars(obs, sample, Around.of(cal), n, effects, total)
         cal = with_effects_of(stars, cal, effects)
-        if cal.effects is not None and cal.effects.fitted:
-            held = replace(cal.effects, node_grams=cal.effects.node_grams[:0])
+        held = cal.known_effects
+        if held.fitted:
+            held = replace(held, node_grams=held.node_grams[:0])
             beside = Beside(stars.files, held, cal.theta, cal.sigma)
     camera, theta, sigma = cal.camera, cal.theta, cal.sigma
     scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))

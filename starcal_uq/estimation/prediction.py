@@ -48,14 +48,14 @@ class PredictedCamera:
 
 def predicted(
     estimate: PredictedCamera,
-    effects: Effects | None,
+    effects: Effects,
     temperature_c: float | None = None,
     time_utc: str | None = None,
     new_night: bool = False,
 ) -> PredictedCamera:
     """The camera of an estimate with effects; `Calibration.at` describes the others."""
-    camera, names = estimate.camera, () if effects is None else effects.names
-    if effects is None or not effects.fitted:
+    camera, names = estimate.camera, effects.names
+    if not effects.fitted:
         if temperature_c is None and time_utc is None and not new_night:
             return estimate
         raise CalibrationError(
@@ -90,7 +90,7 @@ def predicted(
 
 def displacement(
     estimate: PredictedCamera,
-    effects: Effects | None,
+    effects: Effects,
     xy: FloatArray,
     names: Collection[str] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
@@ -98,10 +98,10 @@ def displacement(
     those of some `names` or all; see `Calibration.displacement`.
     """
     n = len(xy)
-    if effects is None:
+    if not effects.fitted:
         return np.zeros((n, 2)), np.zeros((n, 2, 2))
-    view, known = pixels_of(estimate.camera, xy.T), place_effects(estimate.camera)
     columns = np.zeros((len(effects.coefficients), 2, n))
+    view, known = pixels_of(estimate.camera, xy.T), place_effects(estimate.camera)
     for name, effect in known.items():
         if name in effects.names and (names is None or name in names):
             columns[effects.at(name)] = effect.columns.columns(view)

@@ -271,6 +271,11 @@ class Calibration(Deferring, Shown, Traced):
         return quaternion_to_rotation(self.quaternions)
 
     @property
+    def known_effects(self) -> Effects:
+        """The effects; none of them where it holds none."""
+        return self.effects or Effects()
+
+    @property
     def remedy(self) -> str:
         """Fault and remedy of a calibration that did not end well, in one clause."""
         return remedy_of(self.status, self.undetermined, self.camera.distortion, self.solver)
@@ -393,7 +398,7 @@ class Calibration(Deferring, Shown, Traced):
             When the calibration holds no such effect.
         """
         estimate = PredictedCamera(self.camera, self.covariance)
-        return predicted(estimate, self.effects, temperature_c, time_utc, new_night)
+        return predicted(estimate, self.known_effects, temperature_c, time_utc, new_night)
 
     def displacement(
         self, xy: ArrayLike, names: Collection[str] | None = None
@@ -417,7 +422,7 @@ class Calibration(Deferring, Shown, Traced):
         """
         pixels = np.atleast_2d(np.asarray(xy, dtype=np.float64))
         estimate = PredictedCamera(self.camera, self.covariance)
-        return displacement(estimate, self.effects, pixels, names)
+        return displacement(estimate, self.known_effects, pixels, names)
 
     def directions(self, xy: ArrayLike) -> FloatArray:
         """Unit vectors (n, 3) in the camera frame of what is seen at pixels (n, 2), by the camera
@@ -430,9 +435,9 @@ class Calibration(Deferring, Shown, Traced):
         """Log likelihood (n,) of the whole data set at theta (n, p), px units, and sigma (n,), the
         scales of effects integrated.
         """
-        if self.effects is None or not self.effects.fitted:
+        if not self.known_effects.fitted:
             return self.compressed.log_likelihood(theta, sigma)
-        return self.effects.mixed(self.compressed, theta, sigma)
+        return self.known_effects.mixed(self.compressed, theta, sigma)
 
     @property
     def n_stars(self) -> int:

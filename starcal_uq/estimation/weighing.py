@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.noise_model import axes_p, star_squares, uneven_p
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+from starcal_uq.likelihood.fitted_effects import FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.student import DEFAULT_DOF, DOF_RANGE
 from starcal_uq.observations.frames import StarFrames
@@ -104,7 +104,7 @@ def with_weighing(obs: Observations, cal: Calibration, noise: bool, tails: bool)
         found.append(FittedEffect.weighing("tails", share * gain, dof=nu))
     if not found:
         return cal
-    held = Effects((), False, (), 0.0) if cal.effects is None else cal.effects
+    held = cal.known_effects
     asked = (*(effect.name for effect in found), *held.asked)
     held = replace(held, weighing=tuple(found), asked=asked)
     record = cal.provenance.with_settings(effects=list(held.names))

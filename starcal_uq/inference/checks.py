@@ -34,6 +34,7 @@ from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.inference.posterior import Derived, Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
 from starcal_uq.likelihood.student import DEFAULT_DOF
+from starcal_uq.maths.linear import whitened
 
 if TYPE_CHECKING:
     from starcal_uq.inference.exact import FrameSample
@@ -166,11 +167,8 @@ def check_compression(
     p = theta.shape[1]
     difference, slack = known(draws)
     # The factor is lower triangular, so its leading block is the factor of theta's covariance.
-    scale = np.diag(laplace.transform)[:p]
-    z = np.linalg.solve(
-        laplace.transform[:p, :p] / scale[:, None], ((theta - laplace.mode[:p]) / scale).T
-    )
-    near = np.sum(z * z, axis=0) <= _REACH_SD**2
+    z = whitened(theta - laplace.mode[:p], laplace.transform[:p, :p])
+    near = np.sum(z * z, axis=1) <= _REACH_SD**2
     size = np.abs(difference) + slack
     max_difference = max(float(np.max(size[near])) if np.any(near) else float(np.max(size)), whole)
     khat = 0.0 if float(np.max(size)) <= _HARMLESS else float(psis(difference)[1])

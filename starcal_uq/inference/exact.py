@@ -129,7 +129,7 @@ def _off_at_the_estimate(obs: Observations, cal: Calibration) -> float | None:
     """Difference of the compressed likelihood from the sum of squares that another pass over all
     stars has found at the estimate, nat; None where the calibration does not know it.
     """
-    beside = (cal.effects and cal.effects.names, cal.ties, cal.noise_model, cal.partitions)
+    beside = (cal.known_effects.names, cal.ties, cal.noise_model, cal.partitions)
     if any(beside) or obs.data_hash != cal.provenance.data_sha256:
         return None
     whole = cal.compressed

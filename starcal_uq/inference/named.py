@@ -32,7 +32,7 @@ from starcal_uq.inference.target import (
     start_target,
 )
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
-from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
+from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse, whitened
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -69,6 +69,17 @@ class Source:
     checks: tuple[Check, ...] = ()  # Checks that need no draws
     # What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     sample: FrameSample | None = None
+
+    def target(
+        self, log_likelihood: LogLikelihood, priors: Priors, given: float | None = None
+    ) -> Target:
+        """The posterior by `log_likelihood`, around the maximum; `given` is a noise that is
+        known.
+        """
+        sigma = self.sigma if given is None else given
+        information = self.information * (self.sigma / sigma) ** 2
+        about = self.theta, information, sigma, self.dof, given is not None, self.extra
+        return start_target(log_likelihood, priors, *about)
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
@@ -153,17 +164,7 @@ def quick_target(
     evaluate = source.exact if source.fast is None else source.fast
     if evaluate is None:
         raise SamplingError(f"the likelihood {source.name!r} cannot be evaluated: give another.")
-    noise = source.sigma if sigma is None else sigma
-    start = start_target(
-        evaluate,
-        priors,
-        source.theta,
-        source.information * (source.sigma / noise) ** 2,
-        noise,
-        source.dof,
-        sigma is not None,
-        source.extra,
-    )
+    start = source.target(evaluate, priors, sigma)
     return laplace_approximation(start)[0], source.fast is not None
 
 
@@ -203,7 +204,7 @@ def _named_source(
         )
     if likelihood == "marginal":
         return _marginal(obs, cal)
-    if cal.effects and cal.effects.fitted:
+    if cal.known_effects.fitted:
         raise SamplingError(
             f"the calibration holds effects, which the likelihood {likelihood!r} does not know: "
             "sample with likelihood='marginal', or calibrate with effects='none'."
@@ -214,8 +215,7 @@ def _named_source(
             f"{likelihood!r} does not know: sample with likelihood='marginal', or calibrate "
             "without relative_attitudes and mount."
         )
-    if obs is None:
-        raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
+    assert obs is not None, "names were checked before"
     if cal.partitions is not None:
         raise SamplingError(
             f"the likelihood {likelihood!r} needs all stars at once, which partitioned "
@@ -265,7 +265,7 @@ def _marginal(obs: Observations | None, cal: Calibration) -> Source:
             exact = sample.log_likelihood
         else:
             exact = _scales_integrated(cal, ExactMarginal(obs, cal).log_likelihood)
-            of_stars = cal.effects is not None and cal.effects.star_px > 0.0
+            of_stars = cal.known_effects.star_px > 0.0
             # Stars that bring errors along make frames depend on each other.
             if obs.n_frames > _MANY * SAMPLED_FRAMES and not of_stars:
                 sample = FrameSample(obs, cal)
@@ -277,7 +277,7 @@ def _scales_integrated(cal: Calibration, exact: LogLikelihood) -> LogLikelihood:
     """An exact likelihood at the best scales of effects with what integrating over the scales
     changes.
     """
-    if not (cal.effects and cal.effects.fitted):
+    if not cal.known_effects.fitted:
         return exact
 
     def integrated(theta: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -332,9 +332,7 @@ class _AdjustedStudent:
         self._wide = scaled_cholesky(fit.covariance)
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray, *nu: FloatArray) -> FloatArray:
-        scale = np.diag(self._wide)
-        z = np.linalg.solve(self._wide / scale[:, None], ((theta - self._theta) / scale).T)
-        points = self._theta + (self._narrow @ z).T
+        points = self._theta + (self._narrow @ whitened(theta - self._theta, self._wide).T).T
         dof = nu[0] if nu else np.full(len(points), self._nu)
         value: FloatArray = self._fit.likelihood.many(points, sigma, dof)
         return value

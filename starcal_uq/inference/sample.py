@@ -51,7 +51,6 @@ from starcal_uq.inference.target import (
     Target,
     importance_check,
     laplace_approximation,
-    start_target,
 )
 from starcal_uq.inference.update import check_chain
 from starcal_uq.likelihood.fitted_effects import Effects
@@ -230,20 +229,7 @@ class _Run:
         return self.streams[1].spawn(1)[0]
 
     def start(self, log_likelihood: LogLikelihood) -> Target:
-        source = self.source
-        sigma = source.sigma if self.given is None else self.given
-        information = source.information * (source.sigma / sigma) ** 2
-        given = self.given is not None
-        return start_target(
-            log_likelihood,
-            self.priors,
-            source.theta,
-            information,
-            sigma,
-            source.dof,
-            given,
-            source.extra,
-        )
+        return self.source.target(log_likelihood, self.priors, self.given)
 
     def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood | None:
         if self.mode is None:
@@ -299,9 +285,9 @@ def _with_fallback(
 ) -> tuple[_Outcome, CompressionCheck]:
     exact, fast = run.source.exact, run.source.fast
     if exact is None:
-        # Without observations there is a compressed likelihood or nothing: names were checked
-        # before.
-        return run.sample("compressed", _present(fast), checkpoint), CompressionCheck()
+        # Without observations there is a compressed likelihood: names were checked before.
+        assert fast is not None
+        return run.sample("compressed", fast, checkpoint), CompressionCheck()
     if evaluation == "exact":
         return run.sample("exact", exact, checkpoint), CompressionCheck()
     files: list[str] = []
@@ -336,12 +322,6 @@ def _degrees(run: _Run, evaluation: Evaluation) -> tuple[int, ...]:
         # minutes.
         return (0, _DEGREES[-1])
     return (0,)
-
-
-def _present(fast: LogLikelihood | None) -> LogLikelihood:
-    if fast is None:
-        raise SamplingError("this likelihood needs the observations: give obs.")
-    return fast
 
 
 def _attempt(checkpoint: PathLike | None, files: list[str]) -> str | None:
@@ -399,7 +379,7 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
         camera=cal.camera,
         provenance=run.provenance,
         dof_draws=None if extra is None else extra.reshape(-1),
-        star_error_px=0.0 if cal.effects is None else cal.effects.star_px,
+        star_error_px=cal.known_effects.star_px,
         effects=_effects(cal, draws.reshape(-1, len(shown))[:, :-1]),
     )
     derived = derived_quantities(posterior)
@@ -411,10 +391,10 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
 
 def _effects(cal: Calibration, theta: FloatArray) -> Effects | None:
     """The effects of a calibration beside draws (n, p) of the parameters."""
-    if cal.effects is None or not cal.effects.fitted:
+    if not cal.known_effects.fitted:
         return None
     shift, covariance = theta.mean(axis=0) - cal.theta, np.cov(theta, rowvar=False)
-    return cal.effects.about(cal.compressed, shift, covariance)
+    return cal.known_effects.about(cal.compressed, shift, covariance)
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:

@@ -14,8 +14,9 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.types import FloatArray, IntArray, floats
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.inference.target import Target, curvature
+from starcal_uq.maths.linear import whitened
 
 # Points per coefficient, and their spread against the posterior's.
 _OVERSAMPLING = 2.5
@@ -50,9 +51,7 @@ class PolynomialLikelihood:
         if self.target.extra is not None:
             columns.append(np.log(extra[0] - self.target.extra.bound))
         point = np.column_stack(columns)
-        scale = np.diag(self.target.transform)
-        shift = (point - self.target.centre) / scale
-        u: FloatArray = floats(np.linalg.solve(self.target.transform / scale[:, None], shift.T).T)
+        u = whitened(point - self.target.centre, self.target.transform)
         return np.concatenate([self._at(u[i : i + _CHUNK]) for i in range(0, len(u), _CHUNK)])
 
     def _at(self, u: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import squares_by
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.likelihood.solvers import Normal, is_singular
-from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_inverse
+from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_inverse, whitened
 from starcal_uq.observations.frames import StarFrames
 
 Variability = Literal["auto", "expected", "empirical"]
@@ -83,11 +83,7 @@ class PairLikelihood:
 
     def whiten(self, theta: FloatArray) -> FloatArray:
         """Whitened parameters (n, p): of unit covariance under `covariance`."""
-        scale = np.diag(self.whitening)
-        shift = (np.atleast_2d(np.asarray(theta, dtype=np.float64)) - self.theta_hat) / scale
-        return np.asarray(
-            np.linalg.solve(self.whitening / scale[:, None], shift.T).T, dtype=np.float64
-        )
+        return whitened(np.atleast_2d(theta) - self.theta_hat, self.whitening)
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray | float) -> FloatArray:
         """Log likelihood (n,) at theta (n, p) and sigma (n,), from the Gram matrix."""

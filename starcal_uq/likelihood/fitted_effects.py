@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -101,6 +102,11 @@ class FoundAir:
     longitude_std_deg: float = np.nan
 
 
+# Arrays that hold nothing.
+_NO_VECTOR, _NO_MATRIX = partial(np.zeros, 0), partial(np.zeros, (0, 0))
+_NO_PAIRS = partial(np.zeros, (0, 2))
+
+
 @dataclass(frozen=True, eq=False)
 class Effects(Shown):
     """Effects of a calibration, the first that was taken up first, and what they say of the camera.
@@ -109,20 +115,20 @@ class Effects(Shown):
     scales.
     """
 
-    fitted: tuple[FittedEffect, ...]  # Those that shift stars
-    selected: bool  # Whether the data were to choose, beside those that were asked for
+    fitted: tuple[FittedEffect, ...] = ()  # Those that shift stars
+    selected: bool = False  # Whether the data were to choose, beside those that were asked for
     # Candidates that were not taken up, and what the next one would have gained, nat
-    refused: tuple[tuple[str, float], ...]
-    penalty_nat: float  # Gain that an effect has to exceed
-    coefficients: FloatArray = field(default_factory=lambda: np.zeros(0))  # (m,): best ones
+    refused: tuple[tuple[str, float], ...] = ()
+    penalty_nat: float = 0.0  # Gain that an effect has to exceed
+    coefficients: FloatArray = field(default_factory=_NO_VECTOR)  # (m,): best ones
     # (m, m): covariance of the coefficients at the best scales
-    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    covariance: FloatArray = field(default_factory=_NO_MATRIX)
     # (p, m): covariance of the camera's parameters with them, px units
-    cross: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    cross: FloatArray = field(default_factory=_NO_MATRIX)
     # (J, q, q), (J,): Gram matrices of the compressed likelihood at the nodes, the best scales
     # first, and log weights of the nodes in the mixture
     node_grams: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    node_log_weights: FloatArray = field(default_factory=lambda: np.zeros(0))
+    node_log_weights: FloatArray = field(default_factory=_NO_VECTOR)
     # Where the camera's parameters hold, and what one standard deviation of the temperature is,
     # degC; first and last time, seconds since 1970; NaN of what the table lacks
     temperature_c: tuple[float, float] = (np.nan, np.nan)
@@ -133,10 +139,10 @@ class Effects(Shown):
     # (K, c), px at the corner: coefficients of the frames' effect and their standard deviations;
     # (S, 2), px at the boresight: those of the stars along two axes on the sky. None where there is
     # no such effect, and in files of earlier versions.
-    frames: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    frame_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    stars: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    star_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    frames: FloatArray = field(default_factory=_NO_MATRIX)
+    frame_sigmas: FloatArray = field(default_factory=_NO_MATRIX)
+    stars: FloatArray = field(default_factory=_NO_PAIRS)
+    star_sigmas: FloatArray = field(default_factory=_NO_PAIRS)
     extent: Extent | None = None  # Of all frames, where their residuals are those of a sample
     weighing: tuple[FittedEffect, ...] = ()  # Noise that varies, and tails
     of_camera: tuple[FittedEffect, ...] = ()  # Those that became parameters of the camera: axes
@@ -164,9 +170,6 @@ class Effects(Shown):
         own = FittedEffect("star", tau, tau / factor, tau * factor, nothing, nothing, nothing, "")
         return cls(
             (own,),
-            False,
-            (),
-            0.0,
             cross=np.zeros((len(compressed.theta_hat), 0)),
             node_grams=compressed.gram[None],
             node_log_weights=np.zeros(1),

@@ -112,6 +112,14 @@ def scaled_cholesky(covariance: FloatArray) -> FloatArray:
     return np.asarray(sd[:, None] * np.linalg.cholesky(correlation))
 
 
+def whitened(shifts: FloatArray, factor: FloatArray) -> FloatArray:
+    """Coordinates z (n, p) of shifts ``factor @ z`` (n, p), by a triangular factor (p, p) whose rows
+    differ by many powers of ten.
+    """
+    scale = np.diag(factor)
+    return np.asarray(np.linalg.solve(factor / scale[:, None], (shifts / scale).T).T)
+
+
 def is_positive(matrix: FloatArray, *, strictly: bool = True) -> bool:
     """Whether a matrix (p, p) is symmetric to rounding, and positive definite, or else
     semidefinite.

@@ -22,7 +22,6 @@ from starcal_uq.core.status import (
     judged,
 )
 from starcal_uq.core.types import AnyDict, BoolArray
-from starcal_uq.diagnostics.beside import has_effects
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.predictive import EXTREME_P
 from starcal_uq.diagnostics.verdict.effect import (
@@ -116,7 +115,7 @@ def estimators_agree(cal: Calibration) -> Check | None:
     """Do the interstar angles alone (the paper's estimator) lead to the same camera?"""
     difference = np.abs(cal.pair_theta - cal.theta)
     # Angles alone know of no effects, which move them by more than their noise.
-    if has_effects(cal) or not np.any(difference > 0.0):
+    if cal.known_effects.fitted or not np.any(difference > 0.0):
         return None
     # The pair estimator is the less efficient one, so its own covariance bounds that of the
     # difference.

@@ -164,7 +164,7 @@ def judge(
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
     checks += requirements
-    held = () if cal.effects is None else cal.effects.names
+    held = cal.known_effects.names
     place = place if place is None else replace(place, held=held)
     made = [check for check in checks if check is not None]
     found = tuple(check if place is None else place.exact(check) for check in made)

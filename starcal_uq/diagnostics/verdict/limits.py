@@ -57,7 +57,7 @@ def _systematic(obs: Observations, cal: Calibration) -> Finding | None:
         return Finding(Limit.PATTERN, {"pattern_arcsec": arcsec})
     if not obs.origin.apparent:
         return Finding(Limit.DIRECTIONS)
-    estimated = cal.effects is not None and cal.effects.air is not None
+    estimated = cal.known_effects.air is not None
     return Finding(Limit.AIR) if obs.origin.air == "unknown" and not estimated else None
 
 

@@ -443,7 +443,7 @@ _WEATHER = 0.04
 
 def _estimated(cal: Calibration) -> Finding | None:
     """The air that the calibration has estimated, and where; None where it has not."""
-    found = None if cal.effects is None else cal.effects.air
+    found = cal.known_effects.air
     return None if found is None else Finding(Note.REFRACTION_ESTIMATED, {"found": found})
 
 
