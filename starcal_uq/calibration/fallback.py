@@ -31,6 +31,7 @@ from starcal_uq.estimation.undetermined import (
 )
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.table import Observations
 
 # Ends that a better start may mend.
@@ -180,12 +181,12 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
     """
     from scipy.special import fdtrc
 
-    if cal.provenance.likelihood == "student_t":
+    if cal.has_tails:
         # Of wrong stars a Gaussian test would ask for anything.
         return False
     likelihood, theta = _as_richer(obs, cal, richer)
     normal = likelihood.evaluate(theta)
-    scale = 1.0 / np.sqrt(np.diag(normal.matrix))
+    scale = 1.0 / root_diagonal(normal.matrix)
     values, vectors = np.linalg.eigh(normal.matrix * np.outer(scale, scale))
     kept = values > _ABSORBED
     gain = float(np.sum((vectors[:, kept].T @ (scale * normal.gradient)) ** 2 / values[kept]))

@@ -16,17 +16,18 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation import effects
+from starcal_uq.estimation.effects import beside_effects
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.zenith import Images, orthonormal
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.effect_sums import Columns
-from starcal_uq.likelihood.effects import effects_of, star_effect
+from starcal_uq.likelihood.effects import star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.maths.linear import principal
 from starcal_uq.observations.frames import StarFrames
-from starcal_uq.observations.splits import one_of_each
+from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -37,23 +38,6 @@ FRAMES, _STARS = 200, 4000
 # Directions of which what is fitted already takes all but this share of the square are not there.
 _ABSORBED = 1e-8
 _STARS_AT_ONCE = 10_000
-
-
-def with_effects_of(
-    obs: Observations, cal: Calibration, rotations: FloatArray, whole: Observations
-) -> EffectLikelihood:
-    """Exact likelihood with the effects of a calibration, for frames of the table `whole` at these
-    attitudes (K, 3, 3).
-
-    Frames that are not all of the table lack effects of nights.
-    """
-    seen, held = None if obs.n_frames == whole.n_frames else obs, cal.known_effects
-    known = effects_of(whole, cal.camera, seen=seen, zeniths=held.zeniths, extent=held.extent)
-    found = [known[own.name] for own in held.fitted if own.name in known]
-    frames = StarFrames.from_observations(obs)
-    ratio = {effect.name: held.ratio(cal.sigma)[effect.name] for effect in found}
-    at = (cal.theta, rotations, cal.sigma)
-    return EffectLikelihood(frames, cal.camera.distortion, found, ratio, *at)
 
 
 class StarNoise(NamedTuple):
@@ -72,10 +56,8 @@ def images_beside(
     most: int = FRAMES,
 ) -> Images:
     """Images of some frames beside the effects of a calibration, or beside errors of stars."""
-    chosen = one_of_each(
-        obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed
-    )
-    some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
+    most = min(most, max(_STARS * obs.n_frames // obs.n_stars, 3))
+    some, chosen = frame_sample(obs, most, seed)
     model, rotations = cal.camera.distortion, cal.rotations[chosen]
     likelihood = None
     if errors is not None:
@@ -85,7 +67,7 @@ def images_beside(
         at = (cal.theta, rotations, errors.sigma)
         likelihood = EffectLikelihood(frames, model, [stars], ratio, *at)
     elif cal.known_effects.fitted:
-        likelihood = with_effects_of(some, cal, rotations, obs)
+        likelihood = beside_effects(some, cal, rotations, obs)
     return Images(some, cal, rotations, likelihood)
 
 
@@ -102,7 +84,7 @@ def normals_beside(obs: Observations, cal: Calibration) -> FrameNormals:
     Those of frames are marginalised in each; those of the run and of stars, which frames share, are
     as the calibration has them.
     """
-    exact = with_effects_of(obs, cal, cal.rotations, obs)
+    exact = beside_effects(obs, cal, cal.rotations)
     return FrameNormals.beside(exact, cal.theta)
 
 
@@ -162,7 +144,7 @@ class Freed:
         frames, e = likelihood.frames, state.e
         held = cal.known_effects.of(obs, cal.camera)
         if any(effect.grouping == "star" for effect in held):
-            exact = with_effects_of(obs, cal, rotations, obs)
+            exact = beside_effects(obs, cal, rotations)
             _, found = exact.conditioned(state, e[None])
             e = e - exact.shifts(state, exact.of_effect("star", found))[0]
         linear = [effect for effect in held if effect.grouping != "star"]

@@ -20,6 +20,7 @@ from starcal_uq.core.types import FloatArray, Shapes, floats
 from starcal_uq.diagnostics.beside import normals_beside
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
+from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -158,9 +159,9 @@ class Jackknife(Shown):
         return pd.DataFrame(
             {
                 "parameter": list(self.parameter_names),
-                "formal_sigma": np.sqrt(np.diag(self.formal_covariance)),
-                "jackknife_sigma": np.sqrt(np.diag(self.jackknife_covariance)),
-                "sandwich_sigma": np.sqrt(np.diag(self.sandwich_covariance)),
+                "formal_sigma": root_diagonal(self.formal_covariance),
+                "jackknife_sigma": root_diagonal(self.jackknife_covariance),
+                "sandwich_sigma": root_diagonal(self.sandwich_covariance),
                 "ratio": self.ratio,
                 "jackknife_ratio": self.jackknife_ratio,
                 "expected_low": low,

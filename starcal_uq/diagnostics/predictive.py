@@ -16,7 +16,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, floats
-from starcal_uq.diagnostics.beside import with_effects_of
+from starcal_uq.estimation.effects import beside_effects
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -129,7 +129,7 @@ def predictive_check(
     e, h = state.e, state.slopes
     exact: EffectLikelihood | None = None
     if cal.known_effects.fitted:
-        exact = with_effects_of(some, cal, state.rotations, used)
+        exact = beside_effects(some, cal, state.rotations, used)
         # Its images are less what effects are expected to do.
         state, _ = exact.profile(cal.theta, exact.rotations)
 
@@ -165,7 +165,7 @@ def predictive_check(
 def _noise(cal: Calibration, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
     """Noise (1, 2, N) of stars in units of sigma, with the tails and the weights of an estimate."""
     noise = rng.standard_normal((1, *shape))
-    if cal.provenance.likelihood != "student_t":
+    if not cal.has_tails:
         return noise
     # The bivariate t of `likelihood.student`: r^2 / (nu + r^2) is Beta(1, nu / 2), in any direction.
     nu = float(cal.provenance.student_t["dof"])

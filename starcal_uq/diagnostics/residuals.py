@@ -103,7 +103,7 @@ def heard(obs: Observations, cal: Calibration) -> BoolArray:
 
     Frames keep at least three of them, or none.
     """
-    if cal.provenance.likelihood != "student_t":
+    if not cal.has_tails:
         return np.ones(obs.n_stars, dtype=bool)
     # By the scale of the tails: beside their own weights even wrong stars look right.
     plain = by_noise_model(obs, cal)

@@ -30,7 +30,7 @@ from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_numbers, star_term
 from starcal_uq.likelihood.terms import TermSums
-from starcal_uq.maths.linear import principal
+from starcal_uq.maths.linear import principal, root_diagonal
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class StarTest(Shown):
             "sandwich_sigma": self.sandwich_covariance,
             "jackknife_sigma": self.jackknife_covariance,
         }
-        columns = {name: np.sqrt(np.diag(covariance)) for name, covariance in names.items()}
+        columns = {name: root_diagonal(covariance) for name, covariance in names.items()}
         return pd.DataFrame(
             {"parameter": list(self.parameter_names), **columns, "widening": self.widening}
         )

@@ -147,11 +147,10 @@ def calibration_at(
         return settled(found) if settling else found
 
     pair_covariance = Later(lambda: gone.value[1].covariance * wide)
-    made = {name: settings[name] for name in ("method", "solver")}
     return Calibration.of(
         nominal,
         KeptFrames.of(obs, likelihood.frames, attitudes.rotations, e, nominal),
-        made | {"distortion": nominal.distortion} | settings,
+        settings | {"distortion": nominal.distortion},
         theta=theta,
         sigma=sigma,
         dof=dof,

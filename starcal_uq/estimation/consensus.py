@@ -264,5 +264,4 @@ def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
     stated = 0.0 if frames.weight is None else 10.0 / frames.weight / camera.focal_px
     narrow = consensus(b, frames.r, frames.starts, np.maximum(narrow_rad, stated))
     # A frame that falls apart within the narrow tolerance is judged after the calibration.
-    whole = np.repeat(frames.sum(narrow.agree.astype(np.int64)) >= MIN_STARS, frames.sizes)
-    return np.where(whole, narrow.agree, wide.agree), camera
+    return np.where(frames.in_threes(narrow.agree), narrow.agree, wide.agree), camera

@@ -54,6 +54,7 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.shapes import Extent
 from starcal_uq.likelihood.zenith import Zeniths
 from starcal_uq.maths.linear import scaled_cholesky
+from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
@@ -400,6 +401,28 @@ class _Linearised:
 
     def _beside(self, zeniths: Zeniths, logs: Mapping[str, float], sigma: float) -> Restricted:
         return self.restricted(tuple(logs), zeniths, sigma)
+
+
+def beside_effects(
+    obs: Observations,
+    cal: Calibration,
+    rotations: FloatArray,
+    whole: Observations | None = None,
+) -> EffectLikelihood:
+    """Exact likelihood with the effects of a calibration, for frames of the table `whole` at these
+    attitudes (K, 3, 3); by default `obs` is all of it.
+
+    Frames that are not all of the table lack effects of nights.
+    """
+    held, camera = cal.known_effects, cal.camera
+    if whole is None or obs.n_frames == whole.n_frames:
+        found = held.of(obs, camera)
+    else:
+        known = effects_of(whole, camera, seen=obs, zeniths=held.zeniths, extent=held.extent)
+        found = [known[name] for name in held.ratio(1.0) if name in known]
+    ratio = {effect.name: held.ratio(cal.sigma)[effect.name] for effect in found}
+    at = (found, ratio, cal.theta, rotations, cal.sigma)
+    return EffectLikelihood(StarFrames.from_observations(obs), camera.distortion, *at)
 
 
 def without_effects(obs: Observations, cal: Calibration) -> Observations:

@@ -30,7 +30,7 @@ from starcal_uq.estimation.assemble import (
     raise_unless_good,
 )
 from starcal_uq.estimation.kept import KeptFrames
-from starcal_uq.estimation.noise_model import Refit, fit_noise, fit_noise_of_tails
+from starcal_uq.estimation.noise_model import Refit, Refitting, fit_noise, without_tails
 from starcal_uq.estimation.result import Calibration, check_camera
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
 from starcal_uq.estimation.settings import EstimationSettings
@@ -115,14 +115,11 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
 def _near(likelihood: MarginalLikelihood, camera: Camera) -> Stage | None:
     """The refinement from a nominal camera, on a sample of the frames where that saves time; None
     where it strays.
-
-    `likelihood` starts its later searches from there.
     """
     own = MarginalLikelihood(_sample(likelihood.frames), camera.distortion)
     stage = refinement_stage(own, camera.theta, _LEADING)
     if _strayed(stage, camera):
         return None
-    likelihood.use_rotations(likelihood.start_rotations(stage.theta))
     return stage
 
 
@@ -278,16 +275,17 @@ def _with_noise_model(
     """
     max_iterations = settings.max_iterations
     if settings.tails:
-        model = _noise_of_tails(obs, calibration, max_iterations)
+        refit = _with_tails(calibration, max_iterations)
+        model, _ = fit_noise(obs, calibration.camera, refit)
         if model.varies:
             weighted = obs.weighted(model.sigma_px(obs), model.axes)
             calibration = _robust_fit(weighted, camera, settings)
         return model, calibration
-    model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
+    refit = without_tails(calibration.camera, max_iterations)
+    model, theta = fit_noise(obs, calibration.camera, refit)
     if model.varies:
         obs = obs.weighted(model.sigma_px(obs), model.axes)
         likelihood = MarginalLikelihood(obs, camera.distortion)
-        likelihood.use_rotations(likelihood.start_rotations(theta))
         # The estimate from interstar angles has no weights; its covariance and the refinement do.
         search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
         stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, search)]
@@ -298,11 +296,11 @@ def _with_noise_model(
     return model, calibration
 
 
-def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) -> NoiseModel:
-    """The noise model of stars whose residuals have tails: the scale of the t, as it varies."""
+def _with_tails(cal: Calibration, max_iterations: int) -> Refitting:
+    """The fit of stars whose residuals have tails."""
     nu = cal.provenance.settings["dof"]
 
-    def refit(frames: StarFrames, theta: FloatArray) -> Refit | None:
+    def refit(frames: StarFrames, theta: FloatArray, turn: int) -> Refit | None:
         found = refine(
             frames,
             cal.camera.distortion,
@@ -315,7 +313,7 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
             return None
         return Refit(found.stage.theta, found.state.weight, found.nu)
 
-    return fit_noise_of_tails(obs, cal.camera, refit)
+    return refit
 
 
 def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:

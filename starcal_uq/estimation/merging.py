@@ -35,7 +35,7 @@ from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import Optimum, combined, optimum, scaled, total
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.maths.linear import correlation_of
+from starcal_uq.maths.linear import correlation_of, root_diagonal
 from starcal_uq.observations.repeats import Fingerprints, shared
 from starcal_uq.observations.table import Observations
 
@@ -505,7 +505,7 @@ def consistency_between(
         alone = np.array([information[i], information[others].sum(axis=0)])
         distant = float(shift @ np.linalg.solve(difference, shift))
         run_p.append(welch_james(max(distant, 0.0), alone, np.array([dof[i], rest]))[2])
-        z.append(shift / np.sqrt(np.diag(difference)))
+        z.append(shift / root_diagonal(difference))
     found = Consistency(
         names=tuple(names),
         parameter_names=tuple(parameter_names),

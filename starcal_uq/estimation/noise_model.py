@@ -26,6 +26,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.settings import ITERATIONS
 from starcal_uq.estimation.stages import REFINEMENT_TOLERANCE, Search, refinement_stage
 from starcal_uq.likelihood.arrays import BLOCK_STARS
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
@@ -120,7 +121,7 @@ class AxisSums:
 
     def __init__(self) -> None:
         self._n, self._traces, self._products = 0, np.zeros(4), np.zeros((4, 4))
-        self._camera: FloatArray | None = None
+        self._camera: FloatArray = np.zeros((4, 1, 1))
         self._sums, self._squares = np.zeros(3), np.zeros((3, 3))
 
     def add(
@@ -130,8 +131,6 @@ class AxisSums:
         stars (p, 2, N).
         """
         a, p = len(attitude), len(camera)
-        if self._camera is None:
-            self._camera = np.zeros((4, p, p))
         self._n += frames.n_stars
         for first, last in frames.parts(BLOCK_STARS):
             rows = slice(int(frames.starts[first]), int(frames.starts[last]))
@@ -146,7 +145,8 @@ class AxisSums:
             for part in (inner, mixed, mixed[[0, 2, 1, 3]]):
                 flat = part.reshape(4, -1)
                 self._products += flat @ flat.T
-            self._camera += np.einsum("isn,jtn->stij", held[a:], held[a:]).reshape(4, p, p)
+            of_all = np.einsum("isn,jtn->stij", held[a:], held[a:]).reshape(4, p, p)
+            self._camera = self._camera + of_all
             values = np.stack([x**2, y**2, x * y])
             self._sums += values.sum(axis=1)
             self._squares += values @ values.T
@@ -155,8 +155,8 @@ class AxisSums:
         """Noise of the axes; `left` are the degrees of freedom of the residuals, where those of all
         stars are few with or without.
         """
-        n, camera = self._n, np.zeros((4, 0, 0)) if self._camera is None else self._camera
-        taken, flat = self._traces + np.einsum("sii->s", camera), camera.reshape(4, -1)
+        n, flat = self._n, self._camera.reshape(4, -1)
+        taken = self._traces + np.einsum("sii->s", self._camera)
         products = self._products + flat @ flat.T
         free = np.array(
             [
@@ -183,79 +183,67 @@ class AxisSums:
         return AxisNoise(log_ratio, log_ratio_std, float(correlation), float(correlation_std))
 
 
-def fit_noise(
-    obs: Observations, camera: Camera, *, rounds: int = _ROUNDS, max_iterations: int = 200
-) -> tuple[NoiseModel, FloatArray]:
-    """Fit the noise model around an estimate, weights and estimate in turn until they settle.
-
-    `obs`: identified stars; a noise that they state is multiplied.
-    `rounds`: largest number of fits; with 1 the estimate stays where it is.
-    Returns the model, and the estimate (p,) with its weights.
-    """
-    obs, theta = obs.unweighted, camera.theta
-    plain = StarFrames.from_observations(obs)
-    variance, before = np.ones(obs.n_stars), np.ones(obs.n_stars)
-    found: _Round | None = None
-    for turn in range(rounds):
-        axes = None if found is None else found.model.axes
-        frames = replace(plain, weight=1.0 / (obs.sigma_or_one * np.sqrt(variance)), axes=axes)
-        likelihood = MarginalLikelihood(frames, camera.distortion)
-        if turn > 0:
-            likelihood.use_rotations(likelihood.start_rotations(theta))
-            search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
-            stage = refinement_stage(likelihood, theta, search)
-            if not stage.status.ok:
-                break
-            theta = stage.theta
-        last = found
-        found = _round(obs, camera.with_theta(theta), likelihood, variance, found)
-        variance = found.variance
-        if not found.model.varies or _settled(found, last, variance, before):
-            break
-        before = variance
-    assert found is not None
-    return found.model, theta
-
-
 class Refit(NamedTuple):
-    """An estimate whose residuals have tails."""
+    """An estimate for stars of given weights."""
 
     theta: FloatArray  # (p,): px units
     weight: FloatArray  # (N,): precision of each star relative to its scale; 0 where it has no say
-    dof: float  # Degrees of freedom of the tails
+    dof: float  # Degrees of freedom of the tails of its residuals; infinite without any
 
 
-def fit_noise_of_tails(
-    obs: Observations,
-    camera: Camera,
-    refit: Callable[[StarFrames, FloatArray], Refit | None],
-) -> NoiseModel:
-    """Fit the noise model to the scale of tails.
+# An estimate for frames, from theta (p,), in one of the rounds; None where it is not found.
+Refitting = Callable[[StarFrames, FloatArray, int], Refit | None]
 
-    Given its precision, a star is Gaussian, and the mean of its weighted square is that of the
-    scale. Wrong stars, which no noise explains, say nothing of it. `obs`: identified stars. `refit`:
-    the estimate with tails for stars of given weights, from theta (p,); None where it is not found.
-    CalibrationError where it is not found at once.
+
+def without_tails(camera: Camera, max_iterations: int = ITERATIONS) -> Refitting:
+    """The refinement of a Gaussian fit, which begins at its end."""
+    search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
+
+    def refit(frames: StarFrames, theta: FloatArray, turn: int) -> Refit | None:
+        if turn > 0:
+            likelihood = MarginalLikelihood(frames, camera.distortion)
+            stage = refinement_stage(likelihood, theta, search)
+            if not stage.status.ok:
+                return None
+            theta = stage.theta
+        return Refit(theta, np.ones(frames.n_stars), np.inf)
+
+    return refit
+
+
+def fit_noise(
+    obs: Observations, camera: Camera, refit: Refitting | None = None, *, rounds: int = _ROUNDS
+) -> tuple[NoiseModel, FloatArray]:
+    """Fit the noise model around an estimate, weights and estimate in turn until they settle.
+
+    Given its precision, a star with tails is Gaussian, and the mean of its weighted square is that
+    of the scale. Wrong stars, which no noise explains, say nothing of it.
+
+    `obs`: identified stars; a noise that they state is multiplied.
+    `refit`: that `without_tails` by default. `rounds`: largest number of fits; with 1 the estimate
+    of a Gaussian fit stays where it is. Returns the model, and the estimate (p,) with its weights.
+    CalibrationError where an estimate is not found at once.
     """
+    refit = without_tails(camera) if refit is None else refit
     obs, theta = obs.unweighted, camera.theta
     plain, sigma_px = StarFrames.from_observations(obs), obs.sigma_or_one
     found: _Round | None = None
-    for _ in range(_ROUNDS):
+    for turn in range(rounds):
         axes = None if found is None else found.model.axes
         frames = replace(plain, weight=1.0 / sigma_px, axes=axes)
-        again = refit(frames, theta)
+        again = refit(frames, theta, turn)
         if again is None:
             break
         theta = again.theta
-        limit = again.dof * np.expm1(-2.0 * np.log(_WRONG_P) / again.dof)
-        right = again.weight > (again.dof + 2.0) / (again.dof + limit)
-        right &= frames.spread(frames.sum(right.astype(np.float64))) >= 3.0
+        right = again.weight >= (1.0 + 2.0 / again.dof) * _WRONG_P ** (2.0 / again.dof)
+        if np.isfinite(again.dof):
+            right &= frames.in_threes(right)
         part, weight = obs.select(right), np.sqrt(again.weight[right])
         own = replace(frames.select(right), weight=weight / sigma_px[right])
         likelihood = MarginalLikelihood(own, camera.distortion)
         variance = (sigma_px[right] / part.sigma_or_one) ** 2
         last, before = found, sigma_px
-        found = _round(part, camera.with_theta(theta), likelihood, variance, last, weight)
+        found = _round(part, camera.with_theta(theta), likelihood, variance, weight, last)
         sigma_px = found.model.sigma_px(obs)
         if not found.model.varies or _settled(found, last, sigma_px**2, before**2):
             break
@@ -263,7 +251,7 @@ def fit_noise_of_tails(
         raise CalibrationError(
             "how the noise varies cannot be fitted: leave the effect 'noise' out."
         )
-    return found.model
+    return found.model, theta
 
 
 class _Round(NamedTuple):
@@ -271,7 +259,6 @@ class _Round(NamedTuple):
 
     model: NoiseModel
     fit: _Fit
-    variance: FloatArray  # (N,): of every star, in units of the stated one
     number: int  # Of the regressions before
 
 
@@ -280,8 +267,8 @@ def _round(
     camera: Camera,
     likelihood: MarginalLikelihood,
     variance: FloatArray,
+    precision: FloatArray,
     last: _Round | None,
-    precision: FloatArray | None = None,
 ) -> _Round:
     """The regression of residuals at the estimate of a camera, weighed with `variance` (N,) and,
     relative to it, the square of `precision` (N,).
@@ -295,15 +282,12 @@ def _round(
         if last is None or number < _CHOOSING_ROUNDS
         else _fitted(stars, last.fit.terms, last.fit.frame_dof is not None)
     )
-    variance = fit.variance(stars)
-    weight = 1.0 / (obs.sigma_or_one * np.sqrt(variance))
-    if precision is not None:
-        weight = weight * precision
+    weight = precision / (obs.sigma_or_one * np.sqrt(fit.variance(stars)))
     alike = MarginalLikelihood(
         replace(likelihood.frames, weight=weight, axes=None), camera.distortion
     )
     model = _model(obs, camera, stars, fit, axis_noise(alike, camera.theta))
-    return _Round(model, fit, variance, number)
+    return _Round(model, fit, number)
 
 
 def _settled(found: _Round, last: _Round | None, now: FloatArray, before: FloatArray) -> bool:

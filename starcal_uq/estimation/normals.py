@@ -19,7 +19,7 @@ from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.terms import add_by_group
-from starcal_uq.maths.linear import without_first
+from starcal_uq.maths.linear import root_diagonal, without_first
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class StarNormals:
             add_by_group(slopes, np.sum(raised * state.e, axis=1), stars)
             add_by_group(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
         matrix = gram[:p, :p]
-        unit = 1.0 / np.sqrt(np.diag(matrix))
+        unit = 1.0 / root_diagonal(matrix)
         return cls(
             scale=cal.sigmas * unit,
             matrix=matrix * np.outer(unit, unit),

@@ -20,6 +20,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.likelihood.effects import corner_unit, pixels_of, place_effects
 from starcal_uq.likelihood.shapes import TIME_DEGREE, seconds_utc
+from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
     from starcal_uq.likelihood.fitted_effects import Effects
@@ -43,7 +44,7 @@ class PredictedCamera:
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviation of each parameter, (p,)."""
-        return np.sqrt(np.diag(self.covariance))
+        return root_diagonal(self.covariance)
 
 
 def predicted(

@@ -36,7 +36,7 @@ from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.likelihood.ties import FittedTies
 from starcal_uq.maths.intervals import student_quantile
-from starcal_uq.maths.linear import correlation_of, is_positive
+from starcal_uq.maths.linear import correlation_of, is_positive, root_diagonal
 from starcal_uq.observations.repeats import Fingerprints
 
 if TYPE_CHECKING:
@@ -276,6 +276,11 @@ class Calibration(Deferring, Shown, Traced):
         return self.effects or Effects()
 
     @property
+    def has_tails(self) -> bool:
+        """True if its likelihood is that of a Student t."""
+        return self.provenance.likelihood == "student_t"
+
+    @property
     def remedy(self) -> str:
         """Fault and remedy of a calibration that did not end well, in one clause."""
         return remedy_of(self.status, self.undetermined, self.camera.distortion, self.solver)
@@ -283,7 +288,7 @@ class Calibration(Deferring, Shown, Traced):
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviation of each parameter, (p,)."""
-        return np.sqrt(np.diag(self.covariance))
+        return root_diagonal(self.covariance)
 
     @property
     def correlation(self) -> FloatArray:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import undistorted
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
+from starcal_uq.estimation.assemble import raise_unless_good
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.likelihood.arrays import attitudes
 from starcal_uq.likelihood.compressed import CompressedLikelihood, compress
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.solvers import is_singular
@@ -29,7 +30,7 @@ from starcal_uq.likelihood.student import (
     StudentState,
     log_excess_prior,
 )
-from starcal_uq.maths.linear import scaled_inverse, unit_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_inverse, unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -101,17 +102,12 @@ def usable_stars(frames: StarFrames, model_name: str, theta: FloatArray) -> Bool
     to speak of.
     """
     scores = star_scores(frames, model_name, theta)
-    return in_threes(frames, scores <= _DISTRUST * np.median(scores))
+    return frames.in_threes(scores <= _DISTRUST * np.median(scores))
 
 
 def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
     """Some of the stars, without frames that keep fewer than three."""
-    return frames.select(kept & in_threes(frames, kept))
-
-
-def in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
-    """Stars (N,), kept or not, of frames that keep three or more."""
-    return frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0
+    return frames.select(kept & frames.in_threes(kept))
 
 
 def robust_start(
@@ -142,16 +138,11 @@ def robust_start(
             )
         stages = fit(used, round_ >= _OPTICS_ROUNDS)
         at = stages[-1].theta
-        if not (status := stages[-1].status).ok:
-            outcome = f"the calibration did not end well ({status.name})"
-            raise CalibrationError(outcome, status, reason=status.remedy)
-    weight = np.where(trusted | ~in_threes(frames, trusted), 1.0, _NEGLIGIBLE_WEIGHT)
+        raise_unless_good(stages[-1].status)
+    weight = np.where(trusted | ~frames.in_threes(trusted), 1.0, _NEGLIGIBLE_WEIGHT)
     if frames.weight is not None:
         weight = weight * frames.weight**2
-    b = unproject_theta(model_name, at, frames.pixel.T)
-    rotations = quest(
-        b, frames.r.T, frames.starts, weight, covariance=False, on_degenerate="flag"
-    ).rotations
+    rotations = attitudes(frames, model_name, at, weight)
     return RobustStart(stages, trusted, subset(frames, trusted), rotations)
 
 
@@ -274,7 +265,7 @@ def _step(
     """Newton's step where the observed information allows it, the reweighted one elsewhere; halved
     until it gains.
     """
-    scale = 1.0 / np.sqrt(np.diag(information.reweighted))
+    scale = 1.0 / root_diagonal(information.reweighted)
     observed = information.matrix * np.outer(scale, scale)
     reweighted = information.reweighted * np.outer(scale, scale)
     slope = information.score * scale
@@ -298,7 +289,7 @@ def _volume_step(
     a sigma.
     """
     information = likelihood.information(theta, likelihood.state(theta, sigma, nu), sigma)
-    sd = 1.0 / np.sqrt(np.diag(information.matrix))
+    sd = 1.0 / root_diagonal(information.matrix)
     ends = [
         [likelihood.log_likelihood(theta + s * e, sigma, nu) for e in _STEP * np.diag(sd)]
         for s in (1.0, -1.0)
@@ -365,7 +356,7 @@ def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
     """
     frames, theta = fit.likelihood.frames, fit.stage.theta
     kept = fit.state.weight > _NEGLIGIBLE_WEIGHT
-    remaining = kept & in_threes(frames, kept)
+    remaining = kept & frames.in_threes(kept)
     stated = np.ones(frames.n_stars) if frames.weight is None else frames.weight
     weight = (stated * np.sqrt(fit.state.weight))[remaining]
     rotations = fit.state.rotations[frames.sum(remaining.astype(np.float64)) > 0.0]
@@ -393,7 +384,7 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
     likelihood = MarginalLikelihood(weighted, cal.camera.distortion, cal.rotations)
     normal = likelihood.evaluate(cal.theta)
     sigma = float(np.sqrt(normal.cost / (likelihood.dof - len(cal.theta))))
-    alone = np.sqrt(np.diag(scaled_inverse(normal.matrix))) * sigma
+    alone = root_diagonal(scaled_inverse(normal.matrix)) * sigma
     wide = cal.sigmas if cal.coma_factors is None else cal.sigmas / cal.coma_factors
     record["factors"] = dict(zip(cal.parameter_names, (wide / alone).tolist(), strict=True))
     return replace(

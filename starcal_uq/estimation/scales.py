@@ -19,6 +19,8 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.effect_sums import EffectSums, Solved
+from starcal_uq.maths.differences import derivatives
+from starcal_uq.maths.linear import root_diagonal
 
 # False alarms of the whole selection on data without effects.
 _ALPHA = 0.01
@@ -159,9 +161,7 @@ def selected(
         steps = [step for step in steps if step.name in logs]
         now, solved, sigma = restricted.at(logs)
         after = parameters_at(solved, restricted.p)
-        steps.append(
-            Step(name, gain, (after[0] - before[0]) / (sigma * np.sqrt(np.diag(after[1]))))
-        )
+        steps.append(Step(name, gain, (after[0] - before[0]) / (sigma * root_diagonal(after[1]))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,18 +207,11 @@ def nodes_around(restricted: Restricted, logs: Mapping[str, float], sigma: float
 
 def _spread(density: Callable[[FloatArray], float], centre: FloatArray) -> FloatArray:
     """Square root (d, d) of the covariance of a density with this mode, by differences."""
-    d, unit = len(centre), _STEP * np.eye(len(centre))
-    here = density(centre)
-    hessian = np.zeros((d, d))
-    for i in range(d):
-        for j in range(i, d):
-            signs = ((1, 1, 1.0), (1, -1, -1.0), (-1, 1, -1.0), (-1, -1, 1.0))
-            if i == j:
-                own = density(centre + unit[i]) + density(centre - unit[i]) - 2.0 * here
-                hessian[i, i] = own / _STEP**2
-                continue
-            crossed = sum(s * density(centre + a * unit[i] + b * unit[j]) for a, b, s in signs)
-            hessian[i, j] = hessian[j, i] = crossed / (4.0 * _STEP**2)
+
+    def around(steps: FloatArray) -> FloatArray:
+        return np.array([density(centre + step) for step in steps])
+
+    _, _, hessian = derivatives(around, len(centre), _STEP)
     values, vectors = np.linalg.eigh(-hessian)
     # Where the data say little of a scale, its log is known to a factor of three.
     return np.asarray(vectors / np.sqrt(np.maximum(values, 0.8)))
@@ -238,5 +231,5 @@ def forced(restricted: Restricted, names: Sequence[str]) -> tuple[dict[str, floa
     for name in names:
         without = restricted.at(_but(logs, name))
         moved_by = best - parameters_at(without[1], restricted.p)[0]
-        steps.append(Step(name, without[0] - cost, moved_by / (sigma * np.sqrt(np.diag(unit)))))
+        steps.append(Step(name, without[0] - cost, moved_by / (sigma * root_diagonal(unit))))
     return logs, steps

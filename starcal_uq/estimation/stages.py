@@ -30,6 +30,7 @@ from starcal_uq.likelihood.solvers import (
     minpack,
 )
 from starcal_uq.likelihood.sums import Descent
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.frames import StarFrames
 
 # Relative gain that the last step of a pair stage promises: 1e-4 sigma or less for 30,000
@@ -225,7 +226,7 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
         [model.displacement(at[0], at[1], tuple(unit)) for unit in np.eye(n)]
     ).reshape(n, -1)
     matrix, shift = design @ design.T, design @ target.ravel()
-    scale = np.sqrt(np.diag(matrix))
+    scale = root_diagonal(matrix)
     k = np.linalg.lstsq(matrix / np.outer(scale, scale), shift / scale, rcond=None)[0] / scale
     cost = [float(np.sum(target**2)), float(np.sum((target.ravel() - k @ design) ** 2))]
     trajectory = np.stack([np.insert(bare, [3] * n, found) for found in (np.zeros(n), k)])
@@ -281,7 +282,6 @@ def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations:
             costs.append(there.normal.cost)
             if costs[-1] == min(costs):
                 best = there
-        likelihood.use_rotations(likelihood.start_rotations(best.theta))
         search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
         last = _descended(likelihood, best.theta, search)
         return replace(

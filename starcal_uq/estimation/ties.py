@@ -24,7 +24,7 @@ from starcal_uq.likelihood.compressed import settled, unit_covariance
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.sums import Attitudes, frame_sums
 from starcal_uq.likelihood.ties import FittedTies, FixedMount, TiedLikelihood, Ties
-from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -94,7 +94,7 @@ def with_ties(
     seconds = perf_counter() - began
     stage = Stage("ties", trajectory, cost, status, found.evaluations, seconds)
     residuals, turned, attitudes = _tied(likelihood, theta)
-    after = _Squares(likelihood, theta, np.sqrt(np.diag(covariance)))
+    after = _Squares(likelihood, theta, root_diagonal(covariance))
     wide = factors * _tails(cal)
     known = likelihood.ties.known
     settings: AnyDict = {"relative_attitudes": len(known)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.core.findings import clause
 from starcal_uq.core.status import Status
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -111,14 +110,11 @@ def undetermined(
     size = float(k @ scaled_inverse(covariance[lens, lens]) @ k)
     if fdtrc(len(k), dof, size / len(k)) < _NONE_P:
         return (), as_found
-    without = copy(likelihood)
-    if likelihood.rotations is not None:
-        without.use_rotations(likelihood.rotations)
-    matrix = without.evaluate(undistorted(camera.distortion, theta)).matrix
+    matrix = likelihood.evaluate(undistorted(camera.distortion, theta)).matrix
     if found := open_parameters(matrix, noise, camera):
         return found, as_found
     told = scaled_inverse(matrix) * noise**2
-    unsure = np.sqrt(np.diag(told)) > _POINT * _natural(camera)
+    unsure = root_diagonal(told) > _POINT * _natural(camera)
     factors = _without_coma(covariance, told, size, lens)
     by_coma = unsure[:2] & (factors[:2] > COMA_MATTERS)
     if by_coma.any() and not status.ok:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.effects import beside_effects
 from starcal_uq.likelihood.compressed import compress
-from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.ties import TiedLikelihood, Ties
 from starcal_uq.observations.frames import StarFrames
@@ -50,11 +50,8 @@ class ExactMarginal:
         if cal.ties is not None:
             ties = Ties.of(obs.frame_ids, cal.ties.known)
             return TiedLikelihood(obs, model, ties, cal.ties.sigma, cal.rotations)
-        if cal.effects and cal.effects.fitted:
-            effects = cal.effects.of(obs, cal.camera)
-            frames = StarFrames.from_observations(obs)
-            at = (theta, cal.rotations, cal.sigma)
-            return EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)
+        if cal.known_effects.fitted:
+            return beside_effects(obs, cal, cal.rotations)
         same = len(cal.quaternions) == obs.n_frames
         one = MarginalLikelihood(obs, model, cal.rotations if same else None)
         one.use_sums(*one.sums(theta))

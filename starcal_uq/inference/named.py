@@ -243,7 +243,7 @@ def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["
     """Degrees of freedom, "free" or a number in range: as given, else the calibration's, else the
     default.
     """
-    if dof is None and cal.provenance.likelihood == "student_t":
+    if dof is None and cal.has_tails:
         dof = cal.provenance.settings["dof"]
     nu = parse_dof(dof, SamplingError)
     return "free" if nu is None else nu

@@ -26,7 +26,7 @@ from starcal_uq.core.findings import clause
 from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
-from starcal_uq.maths.linear import correlation_of
+from starcal_uq.maths.linear import correlation_of, root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,7 +100,7 @@ class Priors(Shown, ABC):
 
     def _moments(self) -> dict[str, tuple[float, float]]:
         mean, covariance = self.theta_moments()
-        sd = np.sqrt(np.diag(covariance))
+        sd = root_diagonal(covariance)
         names = parameter_names(self.distortion)
         moments = {name: (float(mean[i]), float(sd[i])) for i, name in enumerate(names)}
         # Moments of a log-normal variable with median m and log sd s.

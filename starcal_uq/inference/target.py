@@ -19,6 +19,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.posterior import Laplace
 from starcal_uq.inference.priors import Priors
+from starcal_uq.maths.differences import derivatives
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
 # Half width of the finite differences in standard deviations: the density is so near to a parabola
@@ -156,7 +157,7 @@ def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
     """
     target, converged, steps = start, False, 0
     while not converged and steps < _NEWTON_STEPS:
-        value, gradient, hessian = _derivatives(target.log_density, target.dim)
+        value, gradient, hessian = _derivatives(target)
         square_root = _inverse_square_root(-hessian)
         step = square_root @ (square_root.T @ gradient)
         converged = 0.5 * float(gradient @ step) < _GAIN
@@ -185,27 +186,19 @@ def curvature(target: Target) -> FloatArray:
     """Negative second derivatives (d, d) of the log density at a target's origin, in its
     coordinates.
     """
-    return -_derivatives(target.log_density, target.dim)[2]
+    return -_derivatives(target)[2]
 
 
-def _derivatives(density: Density, d: int) -> tuple[float, FloatArray, FloatArray]:
-    """Value, gradient and Hessian at the origin by central differences, in one vectorised call."""
-    unit = _STEP * np.eye(d)
-    rows, columns = np.triu_indices(d, 1)
-    both = unit[rows] + unit[columns]
-    cross = unit[rows] - unit[columns]
-    values = density(np.concatenate([np.zeros((1, d)), unit, -unit, both, -both, cross, -cross]))
-    if not np.all(np.isfinite(values)):
+def _derivatives(target: Target) -> tuple[float, FloatArray, FloatArray]:
+    """Value, gradient and Hessian of the log density at the origin of a target."""
+    value, gradient, hessian = derivatives(target.log_density, target.dim, _STEP)
+    if not (np.isfinite(gradient).all() and np.isfinite(hessian).all()):
         raise SamplingError(
             "the posterior density is not finite around the calibrated camera: check that the "
             "calibration converged, "
             "that the observations are its own and that the priors allow its estimate."
         )
-    centre, plus, minus = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
-    pp, mm, pm, mp = values[2 * d + 1 :].reshape(4, -1)
-    hessian = np.diag((plus + minus - 2.0 * centre) / _STEP**2)
-    hessian[rows, columns] = hessian[columns, rows] = (pp + mm - pm - mp) / (4.0 * _STEP**2)
-    return float(centre), (plus - minus) / (2.0 * _STEP), hessian
+    return value, gradient, hessian
 
 
 def _inverse_square_root(curvature: FloatArray) -> FloatArray:

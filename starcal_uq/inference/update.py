@@ -21,7 +21,7 @@ from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import SIGMA_NAMES, GaussianPriors, Priors, positive_number
-from starcal_uq.maths.linear import correlation_of
+from starcal_uq.maths.linear import correlation_of, root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -227,7 +227,7 @@ class ShiftTest(Shown):
                 "parameter": self.names,
                 "unit": self.units,
                 "shift": self.shift,
-                "sigma": np.sqrt(np.diag(self.covariance)),
+                "sigma": root_diagonal(self.covariance),
                 "z": self.z,
             }
         )

@@ -32,7 +32,13 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import squares_by
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.likelihood.solvers import Normal, is_singular
-from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_inverse, whitened
+from starcal_uq.maths.linear import (
+    root_diagonal,
+    scaled_cholesky,
+    scaled_inverse,
+    unit_inverse,
+    whitened,
+)
 from starcal_uq.observations.frames import StarFrames
 
 Variability = Literal["auto", "expected", "empirical"]
@@ -278,7 +284,7 @@ def _gram(objective: PairObjective, theta: FloatArray, whitening: FloatArray) ->
 
 def _check_minimum(normal: Normal, covariance: FloatArray) -> None:
     step = scaled_inverse(normal.matrix) @ normal.gradient
-    off = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
+    off = float(np.max(np.abs(step) / root_diagonal(covariance)))
     if not off <= _OFF_MINIMUM:
         raise SamplingError(
             f"the pair estimate of the calibration lies {off:.1f} standard deviations from the "

@@ -24,7 +24,7 @@ from starcal_uq.likelihood import arrays
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood, Profile
 from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.sums import Attitudes, NormalSums, settled_sums, together
-from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
 _pairs = cache(np.triu_indices)
@@ -297,7 +297,7 @@ def combined(
     theta: Sequence[FloatArray], covariance: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Precision-weighted mean (p,) of independent estimates, and its covariance (p, p)."""
-    scale = np.sqrt(np.diag(covariance[0]))
+    scale = root_diagonal(covariance[0])
     outer = np.outer(scale, scale)
     precision = [np.linalg.inv(c / outer) for c in covariance]
     reduced = np.linalg.inv(np.sum(precision, axis=0))

@@ -138,10 +138,6 @@ class MarginalLikelihood:
                 rotations = exp_rotation(turn.T) @ rotations
         return state, float("inf")
 
-    def rotations_at(self, theta: FloatArray) -> FloatArray:
-        """Best attitudes (K, 3, 3) at theta."""
-        return self.profile(theta, self.rotations)[0].rotations
-
     @property
     def rotations(self) -> FloatArray | None:
         """Where attitude searches start, (K, 3, 3), if that was said."""

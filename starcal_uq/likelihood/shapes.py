@@ -102,16 +102,13 @@ def shapes(
     camera: Camera,
     *,
     max_cells: int = MAX_CELLS,
-    seen: Observations | None = None,
 ) -> tuple[Shape, ...]:
     """Every family of shapes that the table allows; magnitude, time and temperature are used where
     they vary.
 
-    `max_cells`: largest number of field cells along the longer side. `seen`: other frames that the
-    same shapes are wanted on. What these do not state is drawn from the table: the time
-        of a frame and its temperature together, the magnitude of a star by itself.
+    `max_cells`: largest number of field cells along the longer side.
     """
-    known = Covariates.of(obs, seen)
+    known = Covariates.of(obs)
     found = [*lens_shapes(camera), _aberration()]
     if known.clock is not None:
         found.append(_drift(known.clock, known.called))

@@ -17,6 +17,11 @@ _WORST_CONDITION = 1e13
 _ROUNDING = 1e-9
 
 
+def root_diagonal(matrix: FloatArray) -> FloatArray:
+    """Roots (p,) of the diagonal of a matrix: the standard deviations of a covariance."""
+    return np.sqrt(np.diag(matrix))
+
+
 def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverses (3, 3, K) and determinants (K,) of symmetric matrices given by xx, xy, xz, yy, yz,
     zz (6, K).
@@ -73,7 +78,7 @@ def unit_inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     The inverse of the matrix itself is ``inverse * np.outer(scale, scale)``.
     """
-    scale = 1.0 / np.sqrt(np.diag(matrix))
+    scale = 1.0 / root_diagonal(matrix)
     return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale))), scale
 
 
@@ -91,7 +96,7 @@ def inverse_diagonal(matrix: FloatArray) -> FloatArray:
 
 def correlation_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Correlations (p, p) and standard deviations (p,) of a covariance."""
-    sd = np.sqrt(np.diag(covariance))
+    sd = root_diagonal(covariance)
     return np.asarray(covariance / np.outer(sd, sd)), sd
 
 

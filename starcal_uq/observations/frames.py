@@ -117,6 +117,10 @@ class StarFrames:
         """Give every star the value of its frame: (..., K) to (..., N)."""
         return np.repeat(values, self.sizes, axis=-1)
 
+    def in_threes(self, kept: BoolArray) -> BoolArray:
+        """Stars (N,), kept or not, of frames that keep three or more."""
+        return self.spread(self.sum(kept.astype(np.int64))) >= 3
+
     def in_pixels(self, whitened: FloatArray) -> FloatArray:
         """Residuals (2, N) in px that were whitened."""
         if self.axes is not None:

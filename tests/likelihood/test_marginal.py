@@ -55,7 +55,7 @@ def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
     assert known[0] == (sums, attitudes) and known[1][0].cost != sums.cost
     likelihood.use_rotations(best)
     assert likelihood.last_sums is None and likelihood.rotations is best
-    assert np.max(off(likelihood.rotations_at(theta))) < 1e-9
+    assert np.max(off(likelihood.profile(theta)[0].rotations)) < 1e-9
 
 
 def test_derivatives_are_whitened_and_no_model_is_likeliest_where_it_is_not_finite():

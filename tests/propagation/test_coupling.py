@@ -58,16 +58,16 @@ def test_directions_of_two_correlated_parameters(r):
 
 def test_common_rotation_is_what_a_wrong_principal_point_does():
     """The analytic response against attitudes solved again with a shifted principal point."""
-    from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_vector
+    from starcal_uq.attitude.rotations import rotation_vector
     from starcal_uq.likelihood.marginal import MarginalLikelihood
 
     obs = observations(n_frames=40)
     cal = sc.calibrate(obs, sc.paper.paper_start())
     likelihood = MarginalLikelihood(obs, "brown")
-    base = quaternion_to_rotation(cal.quaternions)
+    base = cal.rotations
     for index, step in ((0, 0.5), (1, 0.5), (2, 1.0), (3, 1e-9)):
         theta = cal.theta.copy()
         theta[index] += step
-        turned = rotation_vector(likelihood.rotations_at(theta) @ base.transpose(0, 2, 1))
+        turned = rotation_vector(likelihood.profile(theta)[0].rotations @ base.transpose(0, 2, 1))
         expected = cal.rotation_per_theta[:, index] * step
         assert np.allclose(np.mean(turned, axis=0), expected, rtol=5e-3, atol=2e-9)

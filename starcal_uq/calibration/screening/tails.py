@@ -170,6 +170,6 @@ def blamed(
         "allowed": int(allowed),
         "n_rounds": n_rounds,
         "stable": bool(stable),
-        "robust": cal.provenance.likelihood == "student_t",
+        "robust": cal.has_tails,
         "follows_place": bool(follows),
     }

@@ -41,6 +41,7 @@ from starcal_uq.diagnostics.verdict.observed import (
 )
 from starcal_uq.likelihood.shapes import IN_FIELD
 from starcal_uq.maths.intervals import student_quantile
+from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
     from starcal_uq.calibration.cameras import MixedCameras
@@ -119,7 +120,7 @@ def estimators_agree(cal: Calibration) -> Check | None:
         return None
     # The pair estimator is the less efficient one, so its own covariance bounds that of the
     # difference.
-    z = difference / np.sqrt(np.diag(cal.pair_covariance))
+    z = difference / root_diagonal(cal.pair_covariance)
     return _largest_error(Code.TWO_ESTIMATORS, z, ESTIMATORS_P, cal, SCREEN)
 
 
@@ -187,7 +188,7 @@ def model_checks(
     """Every check that a diagnosis allows."""
     moving = EFFECTS if _OF_FRAMES_APART & set(diagnosis.effects) else ()
     # What tails do not describe either is no noise of these stars.
-    robust = SCREEN if cal.provenance.likelihood == "student_t" else ROBUST
+    robust = SCREEN if cal.has_tails else ROBUST
     checks = [
         misfit(diagnosis.misfit, cal, attitude, diagnosis.better, diagnosis.extended),
         even_noise(diagnosis.misfit, EFFECTS if diagnosis.effects else ()),
