@@ -14,6 +14,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.maths.linear import symmetric_inverse
 
 SD = np.array([0.15, 0.15, 0.028, 0.39e-10, 0.073e-15])
@@ -62,7 +63,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "rotation_per_theta": np.arange(15.0).reshape(3, 5) * 1e-4,
         "attitude_noise": np.eye(3) * 1e-12,
         "provenance": Provenance(data_sha256="0" * 64),
-        "effects": None,
+        "known_effects": Effects(),
         "noise_model": None,
         "inflation": None,
         "width_factors": np.ones(5),
