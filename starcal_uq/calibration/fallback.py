@@ -31,7 +31,7 @@ from starcal_uq.estimation.undetermined import (
 )
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.maths.linear import root_diagonal
+from starcal_uq.maths.linear import principal, unit_diagonal
 from starcal_uq.observations.table import Observations
 
 # Ends that a better start may mend.
@@ -186,14 +186,10 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
         return False
     likelihood, theta = _as_richer(obs, cal, richer)
     normal = likelihood.evaluate(theta)
-    scale = 1.0 / root_diagonal(normal.matrix)
-    values, vectors = np.linalg.eigh(normal.matrix * np.outer(scale, scale))
-    kept = values > _ABSORBED
-    gain = float(np.sum((vectors[:, kept].T @ (scale * normal.gradient)) ** 2 / values[kept]))
-    terms, dof = (
-        int(np.count_nonzero(kept)) - len(cal.theta),
-        likelihood.dof - int(np.count_nonzero(kept)),
-    )
+    scaled, scale = unit_diagonal(normal.matrix)
+    values, vectors = principal(scaled, _ABSORBED)
+    gain = float(np.sum((vectors.T @ (scale * normal.gradient)) ** 2 / values))
+    terms, dof = len(values) - len(cal.theta), likelihood.dof - len(values)
     if terms < 1 or dof < 1 or not 0.0 < gain < normal.cost:
         return False
     return bool(fdtrc(terms, dof, gain / terms / ((normal.cost - gain) / dof)) < _WANTED_P)

@@ -25,7 +25,7 @@ from starcal_uq.likelihood.effects import star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
-from starcal_uq.maths.linear import principal
+from starcal_uq.maths.linear import principal, unit_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
 
@@ -121,8 +121,8 @@ class Freed:
         if cal.known_effects.fitted:
             yield cls.of(obs, cal)
             return
-        inner, unit = gram[:-1, :-1], 1.0 / np.sqrt(np.diag(gram)[:-1])
-        values, vectors = principal(inner * np.outer(unit, unit), _ABSORBED)
+        inner, unit = unit_diagonal(gram[:-1, :-1])
+        values, vectors = principal(inner, _ABSORBED)
         turn = (unit[:, None] * vectors / np.sqrt(values)).T
         along = turn @ gram[:-1, -1]
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)

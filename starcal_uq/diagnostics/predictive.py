@@ -180,7 +180,7 @@ def _draws(
     cal: Calibration, post: Posterior | None, n_draws: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     if post is not None:
-        chosen = post.draws[rng.permutation(len(post.draws))[:n_draws]]
+        chosen = post.thin(n_draws, rng)
         return chosen[:, :-1], chosen[:, -1]
     noise = np.sqrt(cal.chi2 / rng.chisquare(cal.dof, n_draws))
     factor = scaled_cholesky(cal.covariance)

@@ -205,11 +205,7 @@ def noise_of(cost: float, frames: StarFrames) -> float:
     """As `noise_px`, from the sum of squares over these frames."""
     if not np.isfinite(cost):
         return float("inf")
-    return float(
-        np.sqrt(
-            cost / (2.0 * (frames.n_stars if frames.weight is None else np.sum(frames.weight**2)))
-        )
-    )
+    return float(np.sqrt(cost / (2.0 * np.sum(frames.noise**-2.0))))
 
 
 def check_noise(noise: float, camera: Camera, status: Status) -> Status:

@@ -19,7 +19,7 @@ from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.terms import add_by_group
-from starcal_uq.maths.linear import root_diagonal, without_first
+from starcal_uq.maths.linear import unit_diagonal, without_first
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -226,11 +226,10 @@ class StarNormals:
             raised /= xx * yy - xy * yx
             add_by_group(slopes, np.sum(raised * state.e, axis=1), stars)
             add_by_group(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
-        matrix = gram[:p, :p]
-        unit = 1.0 / root_diagonal(matrix)
+        matrix, unit = unit_diagonal(gram[:p, :p])
         return cls(
             scale=cal.sigmas * unit,
-            matrix=matrix * np.outer(unit, unit),
+            matrix=matrix,
             squares=float(without_first(gram, p, 0.0, unit)[0][0, 0]),
             scores=scores * unit,
             matrices=matrices * np.outer(unit, unit),

@@ -45,7 +45,7 @@ from starcal_uq.likelihood.compressed import GramSums, gram_sums, optimum, settl
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt, reason_of
 from starcal_uq.likelihood.sums import NormalSums, frame_sums, sum_of
-from starcal_uq.maths.linear import root_diagonal, scaled_cholesky, scaled_inverse
+from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_diagonal
 from starcal_uq.observations.checks import row_hashes
 from starcal_uq.observations.partitions import (
     Partition,
@@ -200,8 +200,8 @@ def _scatter(
     beside: Beside | None,
     part: Partition,
 ) -> FrameScatter:
-    scale = 1.0 / root_diagonal(whole.matrix)
-    scaled = whole.matrix * np.outer(scale, scale), -whole.gradient * scale
+    matrix, scale = unit_diagonal(whole.matrix)
+    scaled = matrix, -whole.gradient * scale
     obs, own = (reader.load(part), None) if beside is None else beside.cleared(part, scale)
     if own is None:
         own = FrameNormals.around(obs, model, theta, None, scale)

@@ -11,11 +11,11 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.likelihood.shapes import Cells
 from starcal_uq.likelihood.sums import sum_of, together
 
 # Residuals beyond it are counted: noise alone gives 7 of a million.
 OUTLIER_SIGMA = 4.5
-_STARS_PER_CELL = 25.0
 
 
 @dataclass(frozen=True)
@@ -43,24 +43,14 @@ class ResidualMap:
         The cells are made for `n_stars` stars in all, about 25 to each: 4 to 12 along the longer
         side.
         """
-        width, height = camera.width_px, camera.height_px
-        longer = max(width, height)
-        along = int(
-            np.clip(np.sqrt(n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12)
-        )
-        cell = longer / along
-        nx, ny = int(np.ceil(width / cell - 1e-9)), int(np.ceil(height / cell - 1e-9))
-        column, row = (
-            np.clip(((values + 0.5) / cell).astype(int), 0, n - 1)
-            for values, n in zip(xy_px, (nx, ny), strict=True)
-        )
-        index = row * nx + column
+        cells = Cells.of(camera, n_stars, 4, 12)
+        index, n = cells.at(xy_px), cells.nx * cells.ny
         return cls(
-            shape=np.array([ny, nx]),
-            cell_px=cell,
-            counts=np.bincount(index, minlength=nx * ny).astype(np.float64),
-            sums=np.stack([np.bincount(index, values, nx * ny) for values in residuals_px], axis=1),
-            stated2=np.bincount(index, stated_px**2, nx * ny).astype(np.float64),
+            shape=np.array([cells.ny, cells.nx]),
+            cell_px=cells.side_px,
+            counts=np.bincount(index, minlength=n).astype(np.float64),
+            sums=np.stack([np.bincount(index, values, n) for values in residuals_px], axis=1),
+            stated2=np.bincount(index, stated_px**2, n).astype(np.float64),
         )
 
     def __add__(self, other: ResidualMap) -> ResidualMap:

@@ -30,7 +30,7 @@ from starcal_uq.likelihood.student import (
     StudentState,
     log_excess_prior,
 )
-from starcal_uq.maths.linear import root_diagonal, scaled_inverse, unit_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_inverse, unit_diagonal, unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -265,9 +265,8 @@ def _step(
     """Newton's step where the observed information allows it, the reweighted one elsewhere; halved
     until it gains.
     """
-    scale = 1.0 / root_diagonal(information.reweighted)
+    reweighted, scale = unit_diagonal(information.reweighted)
     observed = information.matrix * np.outer(scale, scale)
-    reweighted = information.reweighted * np.outer(scale, scale)
     slope = information.score * scale
     sound = np.linalg.eigvalsh(observed)[0] > 0.1 * np.linalg.eigvalsh(reweighted)[0]
     step = np.linalg.solve(observed if sound else reweighted, slope)
@@ -289,13 +288,13 @@ def _volume_step(
     a sigma.
     """
     information = likelihood.information(theta, likelihood.state(theta, sigma, nu), sigma)
-    sd = 1.0 / root_diagonal(information.matrix)
+    matrix, sd = unit_diagonal(information.matrix)
     ends = [
         [likelihood.log_likelihood(theta + s * e, sigma, nu) for e in _STEP * np.diag(sd)]
         for s in (1.0, -1.0)
     ]
     slope = (np.array(ends[0]) - np.array(ends[1])) / (2.0 * _STEP)
-    moved: FloatArray = theta + sd * np.linalg.solve(information.matrix * np.outer(sd, sd), slope)
+    moved: FloatArray = theta + sd * np.linalg.solve(matrix, slope)
     return moved if np.isfinite(moved).all() else theta
 
 
@@ -357,8 +356,7 @@ def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
     frames, theta = fit.likelihood.frames, fit.stage.theta
     kept = fit.state.weight > _NEGLIGIBLE_WEIGHT
     remaining = kept & frames.in_threes(kept)
-    stated = np.ones(frames.n_stars) if frames.weight is None else frames.weight
-    weight = (stated * np.sqrt(fit.state.weight))[remaining]
+    weight = (np.sqrt(fit.state.weight) / frames.noise)[remaining]
     rotations = fit.state.rotations[frames.sum(remaining.astype(np.float64)) > 0.0]
     likelihood = MarginalLikelihood(
         replace(frames.select(remaining), weight=weight), fit.likelihood.model_name

@@ -239,6 +239,18 @@ def positive_number(name: str, value: Any) -> float:
     return number
 
 
+def physical_covariance(
+    widths: Any, focal_px: float, radius_px: float, distortion: str
+) -> FloatArray:
+    """Diagonal covariance (p, p), px units, of widths in physical terms: `principal_point_px`,
+    `focal_fraction` and, at this radius, `distortion_corner_px`.
+    """
+    point, corner = widths.principal_point_px, widths.distortion_corner_px
+    powers = [c.order for c in get_model(distortion).coefficients]
+    terms = [corner / np.float64(radius_px) ** power for power in powers]
+    return np.diag(np.square([point, point, widths.focal_fraction * focal_px, *terms]))
+
+
 # Wide on purpose: a tenth of the detector, 5 % of the focal length and a twentieth of the image
 # radius cover any camera whose data sheet is not wrong, and are hundreds of times wider than what a
 # night of stars determines.
@@ -337,13 +349,11 @@ class PhysicalPriors(Priors):
         """Mean (p,) and diagonal covariance (p, p), px units."""
         x0, y0 = self.principal_point_centre_px
         model = get_model(self.distortion)
-        sd = [self.principal_point_px, self.principal_point_px, self.focal_fraction * self.focal_px]
-        sd += [
-            self.distortion_corner_px / np.float64(self.corner_radius_px) ** c.order
-            for c in model.coefficients
-        ]
+        covariance = physical_covariance(
+            self, self.focal_px, self.corner_radius_px, self.distortion
+        )
         mean = [x0, y0, self.focal_px, *(0.0 for _ in model.lens)]
-        return np.array(mean + list(self.axes if model.axes else ())), np.diag(np.square(sd))
+        return np.array(mean + list(self.axes if model.axes else ())), covariance
 
     def to_dict(self) -> AnyDict:
         """Plain values, for files."""

@@ -14,13 +14,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, parameters
+from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError, check_known
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.posterior import Posterior
-from starcal_uq.inference.priors import SIGMA_NAMES, GaussianPriors, Priors, positive_number
+from starcal_uq.inference.priors import (
+    SIGMA_NAMES,
+    GaussianPriors,
+    Priors,
+    physical_covariance,
+    positive_number,
+)
 from starcal_uq.maths.linear import correlation_of, root_diagonal
 
 if TYPE_CHECKING:
@@ -63,17 +69,8 @@ class AllowedShift:
 
     def covariance(self, camera: Camera) -> FloatArray:
         """Diagonal covariance (p, p) for the parameters of a camera, px units."""
-        radius = float(camera.corner_radius_px)
-        sd = [
-            self.principal_point_px,
-            self.principal_point_px,
-            self.focal_fraction * camera.focal_px,
-        ]
-        sd += [
-            self.distortion_corner_px / radius**c.order
-            for c in get_model(camera.distortion).coefficients
-        ]
-        return np.diag(np.square(sd))
+        radius_px = float(camera.corner_radius_px)
+        return physical_covariance(self, camera.focal_px, radius_px, camera.distortion)
 
 
 def prior_from(

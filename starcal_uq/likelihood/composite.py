@@ -206,8 +206,7 @@ def _pieces(objective: PairObjective, theta: FloatArray) -> Iterator[_Piece]:
     for first, last in objective.frames.parts(_STARS_AT_ONCE):
         part = objective.frames.part(first, last)
         b, db = objective.directions(theta, part)
-        noise = np.ones(part.n_stars) if part.weight is None else 1.0 / part.weight
-        yield part, b, db, noise, part.spread(part.sum(b[:, None] * b[None]))
+        yield part, b, db, part.noise, part.spread(part.sum(b[:, None] * b[None]))
 
 
 def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) -> FloatArray:

@@ -518,17 +518,38 @@ def over_time(clock: FloatArray, called: str) -> Shape:
     )
 
 
+@dataclass(frozen=True)
+class Cells:
+    """Square cells of a detector, row by row: `ny` rows of `nx`."""
+
+    side_px: float
+    nx: int
+    ny: int
+
+    @classmethod
+    def of(cls, camera: Camera, n_stars: int, fewest: int, most: int) -> Cells:
+        """Cells of about 25 of so many stars: `fewest` to `most` of them along the longer side."""
+        sides = camera.width_px, camera.height_px
+        along = np.sqrt(n_stars / _STARS_PER_CELL * max(sides) / min(sides))
+        cell = max(sides) / int(np.clip(along, fewest, most))
+        nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in sides)
+        return cls(cell, nx, ny)
+
+    def at(self, xy: FloatArray) -> IntArray:
+        """Cell (N,) of each of these pixels (2, N)."""
+        column, row = (
+            np.clip(((values + 0.5) / self.side_px).astype(np.int64), 0, n - 1)
+            for values, n in zip(xy, (self.nx, self.ny), strict=True)
+        )
+        return np.asarray(row * self.nx + column)
+
+
 def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
-    longer = max(camera.width_px, camera.height_px)
-    per_area = obs.n_stars / _STARS_PER_CELL * longer / min(camera.width_px, camera.height_px)
-    cell = longer / int(np.clip(np.sqrt(per_area), 2, max_cells))
-    nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
+    field = Cells.of(camera, obs.n_stars, 2, max_cells)
+    nx, ny = field.nx, field.ny
 
     def cells(view: View) -> IntArray:
-        x, y = view.predicted
-        column = np.clip(((x + 0.5) / cell).astype(np.int64), 0, nx - 1)
-        row = np.clip(((y + 0.5) / cell).astype(np.int64), 0, ny - 1)
-        return np.asarray(row * nx + column)
+        return field.at(view.predicted)
 
     def columns(view: View) -> FloatArray:
         own = cells(view)

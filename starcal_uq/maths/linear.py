@@ -72,14 +72,22 @@ def without_first(
     return left, len(values)
 
 
+def unit_diagonal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A symmetric matrix scaled to a unit diagonal, (p, p), and the scale (p,) of its rows and
+    columns.
+    """
+    scale = 1.0 / root_diagonal(matrix)
+    return matrix * np.outer(scale, scale), scale
+
+
 def unit_inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverse (p, p) of a symmetric matrix scaled to a unit diagonal, and the scale (p,) of its
     rows and columns.
 
     The inverse of the matrix itself is ``inverse * np.outer(scale, scale)``.
     """
-    scale = 1.0 / root_diagonal(matrix)
-    return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale))), scale
+    scaled, scale = unit_diagonal(matrix)
+    return np.asarray(np.linalg.inv(scaled)), scale
 
 
 def scaled_inverse(matrix: FloatArray) -> FloatArray:

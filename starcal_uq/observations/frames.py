@@ -85,6 +85,11 @@ class StarFrames:
         """Number of stars over all frames."""
         return int(self.pixel.shape[1])
 
+    @property
+    def noise(self) -> FloatArray:
+        """Stated noise of each star (N,); ones where they state none."""
+        return np.ones(self.n_stars) if self.weight is None else 1.0 / self.weight
+
     @cached_property
     def informed(self) -> IntArray:
         """Number of stars of each frame (K,) that have a say: a weight is nothing beside one 1e8

@@ -465,3 +465,17 @@ def test_estimate_and_coverage_with_wrong_identifications(kind: str, fraction: f
     # independent ones.
     assert np.mean(np.abs(z) < 1.96) > 0.92 - 2 * np.sqrt(0.95 * 0.05 / 50)
     assert np.median(np.mean(z_control, axis=1)) > 3.0
+
+
+def test_noise_of_each_axis_is_no_wrong_star():
+    """Stars that err along one axis alone lie beyond the limit of a noise that is alike."""
+    c = campaign(np.random.default_rng(4), n_frames=20, sigma_px=0.0)
+    rng, n = np.random.default_rng(14), len(c.columns["frame"])
+    for name, sigma in (("x_px", 0.12), ("y_px", 0.012)):
+        c.columns[name] = c.columns[name] + sigma * rng.standard_normal(n)
+    obs, nominal = sc.Observations(**c.columns), sc.Camera(**c.camera_toml())
+    assert screen(obs, nominal).n_rejected > 0
+    found = screen(obs, nominal, effects="noise")
+    assert found.n_rejected == 0
+    assert found.calibration.fitted_noise is not None
+    assert found.calibration.fitted_noise.axis_ratio > 5.0

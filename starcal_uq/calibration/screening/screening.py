@@ -47,7 +47,6 @@ from starcal_uq.core.status import Note, Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.consensus import (
-    MIN_STARS,
     consensus,
     measured_directions,
     pre_screen,
@@ -267,12 +266,11 @@ def _all_that_hangs_together(
         np.sqrt(MARGINAL * -2.0 * np.log(rates.star) * found.robust_variance())
         / calibration.camera.focal_px
     )
-    weight = 1.0 if frames.weight is None else frames.weight
     vote = consensus(
         measured_directions(calibration.camera, frames),
         frames.r,
         frames.starts,
-        4.0 * tolerance / weight,
+        4.0 * tolerance * frames.noise,
     )
     lost = np.repeat(found.frame_count == 0, frames.sizes)
     found = star_residuals(frames, model, theta, np.where(lost, vote.agree, use))
@@ -308,7 +306,7 @@ def _with_noise_model(
     first = screen(obs, camera, **settings, **plain)
     model = calibrate(first.observations, camera, throw=settings["throw"], **options).noise_model
     if model is not None and model.varies:
-        first = screen(obs.weighted(model.sigma_px(obs)), camera, **settings, **plain)
+        first = screen(obs.weighted(model.sigma_px(obs), model.axes), camera, **settings, **plain)
     kept = first.observations.unweighted
     calibration = calibrate(kept, camera, throw=settings["throw"], **options)
     return replace(first, observations=kept, calibration=calibration)
@@ -374,11 +372,9 @@ def _tested(frames: StarFrames, calibration: Calibration, use: BoolArray, rates:
     """
     model, theta, camera = calibration.camera.distortion, calibration.theta, calibration.camera
     robust = star_residuals(frames, model, theta, use).robust_variance()
-    weight = 1.0 if frames.weight is None else frames.weight
-    tolerance = _VOTE_SIGMAS * np.sqrt(robust) / weight / camera.focal_px
+    tolerance = _VOTE_SIGMAS * np.sqrt(robust) * frames.noise / camera.focal_px
     vote = consensus(measured_directions(camera, frames), frames.r, frames.starts, tolerance)
-    whole = np.repeat(frames.sum(vote.agree.astype(np.int64)) >= MIN_STARS, frames.sizes)
-    use = np.where(whole, vote.agree, use)
+    use = np.where(frames.in_threes(vote.agree), vote.agree, use)
     # While wrong stars inflate the sum of squares, only the median tells the noise.
     for _ in range(_MAX_PASSES):
         found = star_residuals(frames, model, theta, use)
