@@ -194,7 +194,7 @@ def measured(target: Target, listed: Sequence[Mapping[str, Any]]) -> dict[str, s
             return "not measured"
         if target.peak:
             return f"{entry['peak_mb']:,.0f} MB"
-        return f"{seconds(entry['processor']['median'])} ({seconds(entry['wall']['median'])})"
+        return taken(entry)
 
     mine = listed[0]
     found = {"target": target.words, "measured": said(mine), "rival": "–"}
@@ -234,25 +234,22 @@ def seconds(value: float) -> str:
     return f"{1e6 * value:.3g} µs"
 
 
+def taken(entry: Mapping[str, Any]) -> str:
+    """Processor time, and the wall time where that differs by more than a tenth."""
+    processor, wall = (entry[clock]["median"] for clock in CLOCKS)
+    waited = f" ({seconds(wall)})" if abs(wall / processor - 1.0) > 0.1 else ""
+    return f"{seconds(processor)}{waited}"
+
+
 def times(found: Mapping[str, float] | None) -> str:
     """Median and quartiles of a ratio."""
     return (
-        "–"
-        if not found
-        else f"**{found['median']:.3g}** ({found['low']:.3g} to {found['high']:.3g})"
+        "–" if not found else f"**{found['median']:.3g}** ({found['low']:.3g}–{found['high']:.3g})"
     )
 
 
-HEAD = (
-    "",
-    "Path and extras",
-    "First call",
-    "Processor",
-    "Wall",
-    "Times ours (processor)",
-    "Peak MB",
-    "Beside our answer",
-)
+OURS = "starcal_uq"
+HEAD = ("", "First call", "Processor (wall)", "Times ours", "Peak MB", "Beside our answer")
 
 
 def table(records: Sequence[Mapping[str, Any]]) -> str:
@@ -261,24 +258,24 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
     for record in records:
         where = "one core" if record["one_core"] else "all cores"
         unit = f" ({record['unit']})" if record["unit"] else ""
-        load = " to ".join(f"{load:.1f}" for load in record["load"])
         lines += [
             f"\n### {record['what']}{unit}\n",
-            f"`{record['name']}`, {where}, {record['made']}, load of the machine {load}.\n",
+            f"`{record['name']}`, {where}\n",
             "| " + " | ".join(HEAD) + " |",
             "|" + "---|" * len(HEAD),
         ]
         for entry in record["contestants"]:
-            how = ", ".join(filter(None, (entry.get("path"), entry["how"])))
-            cells = [entry["label"], how]
+            how = entry.get("path") or ("" if entry["label"].startswith(OURS) else entry["how"])
+            label = f"{entry['label']} ({how})" if how else entry["label"]
             if not entry["turns"]:
                 reason = " ".join((entry["missing"] or "no turn").replace("|", "/").split())
-                lines.append(f"| {entry['label']} | {how} | not measured: {reason} |" + " |" * 5)
+                lines.append(f"| {label} | not measured: {reason} |" + " |" * 4)
                 continue
             first, answer = entry["first_processor"], entry.get("answer", "")
-            cells += [
+            cells = [
+                label,
                 seconds(first) if first else "–",
-                *(seconds(entry[clock]["median"]) for clock in CLOCKS),
+                taken(entry),
                 times(entry.get("processor_ratio")),
                 f"{entry['peak_mb']:,.0f}",
                 answer if entry.get("same", True) else f"**another answer**: {answer}",
@@ -304,8 +301,14 @@ def write(made: Sequence[dict[str, Any]]) -> None:
     ordered = [merged[row.name] for row in rows() if row.name in merged]
     RESULTS.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     machines = "; ".join(sorted({r["machine"] for r in ordered}))
+    days, loads = (
+        sorted({r["made"] for r in ordered}),
+        [load for r in ordered for load in r["load"]],
+    )
+    when = f"{days[0]} to {days[-1]}" if len(days) > 1 else days[0]
+    load = f"load of the machine {min(loads):.1f} to {max(loads):.1f}"
     put(PAGE, "targets", targets(ordered))
-    put(PAGE, "benchmarks", f"Machine: {machines}.\n\n{table(ordered)}")
+    put(PAGE, "benchmarks", f"{machines}; {when}, {load}.\n\n{table(ordered)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

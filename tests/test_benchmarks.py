@@ -100,9 +100,9 @@ def test_a_row_begins_no_turn_after_its_time(planted):
 
 def test_a_row_says_what_differs_and_who_is_missing(planted):
     text = bench.table([bench.run_row(planted)])
-    assert "| absent |  | not measured: it is not installed |" in text
+    assert "| absent | not measured: it is not installed |" in text
     assert "**another answer**: 5 σ" in text
-    assert "| twice |  | 20 s | 600 ms | 1.2 s | **2** (2 to 2) | 50 |" in text
+    assert "| twice | 20 s | 600 ms (1.2 s) | **2** (2–2) | 50 |" in text
 
 
 def test_writing_keeps_rows_that_were_not_run(planted, monkeypatch, tmp_path):
