@@ -371,7 +371,7 @@ def plot_needed(
     if target is not None:
         panels[f"Frames for {target:g} arcsec"] = study.frames_for(target)
     figure, (ax, *_) = plot_swept(study.sweep, panels, **where, wide=2.0)
-    figure.supxlabel("".join(best_axis(study)), fontsize=style.LABEL_SIZE, color=style.GREY)
+    figure.supxlabel("\n".join(best_axis(study)), fontsize=style.LABEL_SIZE, color=style.GREY)
     if target is not None:
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, target / 1.5), max(high, target * 1.5))

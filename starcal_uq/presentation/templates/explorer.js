@@ -172,9 +172,9 @@
       if (i !== n - 1 && (i % every || i && n - 1 - i < every)) return;
       const short = value.length > 20 ? `${value.slice(0, 19)}…` : value, reach = 3 * short.length;
       const middle = Math.max(reach, Math.min(420 - reach, x(i)));
-      make("text", svg, { x: middle, y: bottom + 16 + (numeric ? 0 : 13 * (i % 2)), "text-anchor": "middle" }, short);
+      make("text", svg, { x: middle, y: bottom + 16 + (numeric ? 0 : 12 * (i % 2)), "text-anchor": "middle" }, short);
     });
-    make("text", svg, { x: (left + right) / 2, y: bottom + (numeric ? 34 : 44), "text-anchor": "middle" }, axis.label);
+    make("text", svg, { x: (left + right) / 2, y: bottom + (numeric ? 34 : 41), "text-anchor": "middle" }, axis.label);
     if (line) make("path", svg, { d: `M${left} ${y(line)}H${right}`, class: "target" });
     let start = 6;
     series.forEach((s, k) => {

@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.camera.distortion import COEFFICIENTS, parameter_called
-from starcal_uq.core.formatting import (
-    count,
-    percent,
-    pretty_unit,
-    significant,
-)
+from starcal_uq.core.formatting import count, percent, significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
@@ -26,6 +21,7 @@ from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, axis_name, place, value_words
 from starcal_uq.presentation.words.sentences import say, table
 from starcal_uq.propagation.coupling import COUPLED, PART
+from starcal_uq.studies.axes import EFFECT_AXES
 from starcal_uq.studies.findings import Curve, Pair, place_of
 
 if TYPE_CHECKING:
@@ -34,7 +30,10 @@ if TYPE_CHECKING:
 _COMMON, _REST = "Common [arcsec]", "Rest [arcsec]"
 # Properties of a lens and a catalogue, which a designer does not choose.
 _GIVEN = ("distortion_px", "direction_mas", *COEFFICIENTS)
-_MISSING = "–"
+# What templates write axes, values and places with.
+_WRITTEN: AnyDict = {
+    one.__name__: one for one in (axis_label, correlation_text, place, value_words)
+}
 Forms = Mapping[str, Callable[[float], str]]
 
 
@@ -57,7 +56,8 @@ def study_text(study: Study) -> str:
         n_pairs=len(sweep.pairs),
         limit=COUPLED,
         strongest=dashed(pairs[0]),
-        span=_span([float(pairs[0].strongest), float(pairs[0].weakest)], correlation_text),
+        ends=(pairs[0].strongest, pairs[0].weakest),
+        form=correlation_text,
         changing=[axis_name(axis) for axis in sweep.axes if axis in axes],
     )
 
@@ -68,14 +68,12 @@ def study_answer(study: Study) -> list[str]:
     if not sweep.ok.any():
         return [study_text(study)]
     inflation = study.data["variance_inflation"][sweep.ok] ** 0.5
-    medians = inflation.median("cell").to_series().dropna()
-    price = [f"{name} {significant(factor)}" for name, factor in medians.items()]
-    spans = {"rest": _span(sweep.frame_error), "common": _span(sweep.common_rotation)}
+    price = inflation.median("cell").to_series().dropna()
     return [
         study_text(study),
         say("Study.weakest", **_weakest(study)),
-        say("Study.price", price=price),
-        say("Study.attitude", **spans),
+        say("Study.price", price=price.to_dict()),
+        say("Study.attitude", rest=_ends(sweep.frame_error), common=_ends(sweep.common_rotation)),
         *best_axis(study),
         *_targets(study),
         *_simpler(study),
@@ -84,22 +82,20 @@ def study_answer(study: Study) -> list[str]:
 
 
 def best_axis(study: Study) -> list[str]:
-    """The axis, of those that can be chosen, that changes the frame-dependent error most; nothing
-    where none matters.
+    """The axis, of those that can be chosen, that changes the frame-dependent error most, and what
+    effects of the sensor do to it; nothing where none matters.
     """
     curves = study.sweep.curves(np.log(study.sweep.frame_error))
-    mattering = [curve for curve in curves if curve.matters and curve.axis not in _GIVEN]
-    best = max(mattering, key=lambda curve: curve.change, default=None)
-    if best is None:
-        return []
-    least, most = (value_words(best.values[i]) for i in (best.least, best.most))
-    return [say("Study.best", it=best, axis=axis_label(best.axis), least=least, most=most)]
+    chosen: dict[str, Curve] = {}
+    for curve in sorted(curves, key=lambda curve: curve.change):
+        if curve.matters and curve.axis not in _GIVEN:
+            chosen["sensitive" if curve.axis == EFFECT_AXES[0] else "best"] = curve
+    return [say(f"Study.{kind}", it=curve, **_WRITTEN) for kind, curve in chosen.items()]
 
 
-def _span(values: Any, form: Callable[[float], str] = lambda value: significant(value, 3)) -> str:
-    """Least to most of what is finite."""
-    low, high = form(np.nanmin(values)), form(np.nanmax(values))
-    return low if low == high else f"{low} to {high}"
+def _ends(values: Any) -> tuple[float, float]:
+    """Least and most of what is finite."""
+    return float(np.nanmin(values)), float(np.nanmax(values))
 
 
 def _weakest(study: Study) -> AnyDict:
@@ -115,23 +111,23 @@ def _weakest(study: Study) -> AnyDict:
 
 def _targets(study: Study) -> Iterator[str]:
     """Share of the places that meet each target, and the frames that it takes."""
-    aims = []
-    if (target := study.definition.target_arcsec) is not None:
-        needed = study.frames_for(target)
-        aims.append((f"{target:g} arcsec", target, study.sweep.frame_error, needed))
+    goal = study.definition.target_arcsec
+    aims: list[Any] = (
+        [] if goal is None else [(None, goal, study.sweep.frame_error, study.frames_for(goal))]
+    )
     for name, target in study.definition.target_sigma.items():
-        spec = parameter_called(name)
-        text = f"{significant(target / spec.scale)} {pretty_unit(spec.scaled_unit)} for {name}"
         sigma = study.values("sigma", parameter=name)
-        aims.append((text, target, sigma, study.values("frames_needed_sigma", parameter=name)))
-    for text, target, found, cells in aims:
+        needed = study.values("frames_needed_sigma", parameter=name)
+        aims.append((parameter_called(name), target, sigma, needed))
+    for spec, target, found, cells in aims:
         needed = study.sweep.over(cells).values
         finite = needed[np.isfinite(needed)]
         yield say(
             "Study.target",
-            target=text,
+            spec=spec,
+            target=target,
             met=_share(study, found, target),
-            frames=_span(finite, _frames) if len(finite) else "",
+            frames=[_frames(n) for n in _ends(finite)] if len(finite) else [],
             never=int(np.isinf(needed).sum()),
         )
 
@@ -149,8 +145,7 @@ def _simpler(study: Study) -> Iterator[str]:
         bias = model_bias(study, model)
         if np.isfinite(bias).any():
             share = _share(study, bias, study.sweep.frame_error)
-            left = _span(study.sweep.over(bias))
-            yield say("Study.simpler", model=model, share=share, left=left)
+            yield say("Study.simpler", model=model, share=share, left=_ends(study.sweep.over(bias)))
 
 
 def simpler_models(study: Study) -> list[str]:
@@ -171,24 +166,22 @@ def _simulated(study: Study) -> list[str]:
         return []
     sweep = study.sweep
     choices = [axis for axis in ("method", "likelihood", "prior") if axis in sweep.axes]
-    groups: list[dict[str, Any]] = [{}]
-    groups += [{axis: value} for axis in choices for value in sweep.values[axis]]
+    groups: list[AnyDict] = [{axis: value} for axis in choices for value in sweep.values[axis]]
+    looks = [(name, at) for at in ({}, *groups) for name in sweep.names]
     # One false alarm in a hundred studies, however many intervals are looked at.
-    level = 1.0 - 0.01 / (len(groups) * len(sweep.names))
+    level = 1.0 - 0.01 / len(looks)
     rates, wrong = [], []
-    for at in groups:
-        for name in sweep.names:
-            covered = study.values("covered_95", parameter=name)
-            n, rate = (float(sweep.over(covered, of, [], at)) for of in ("count", "mean"))
-            if n:
-                words = f"{name} {percent(rate, 3)}{f' ({place(at)})' if at else ''}"
-                low, high = binomial_interval(round(n * rate), int(n), level)
-                rates += [] if at else [words]
-                wrong += [] if low <= 0.95 <= high else [words]
+    for name, at in looks:
+        covered = study.values("covered_95", parameter=name)
+        n, rate = (float(sweep.over(covered, of, [], at)) for of in ("count", "mean"))
+        if n:
+            words = f"{name} {percent(rate, 3)}{f' ({place(at)})' if at else ''}"
+            low, high = binomial_interval(round(n * rate), int(n), level)
+            rates += [] if at else [words]
+            wrong += [] if low <= 0.95 <= high else [words]
     if not rates:
         return []
-    n_cells = int(sweep.ok.sum())
-    answer = [say("Study.covered", rates=rates, wrong=wrong, n_cells=n_cells)]
+    answer = [say("Study.covered", rates=rates, wrong=wrong, n_cells=int(sweep.ok.sum()))]
     if "posterior_sigma" in study.data:
         ratio = (study.data["posterior_sigma"] / study.data["sigma"]).values[study.ok]
         low, middle, high = np.nanquantile(ratio, (0.05, 0.5, 0.95))
@@ -214,7 +207,7 @@ def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
     """Whether a designer can choose the axis, and both sigmas are smaller where the pair is least
     coupled than where it is most.
     """
-    if cost.axis in _GIVEN:
+    if cost.axis in (*_GIVEN, EFFECT_AXES[0]):
         return False
     known = np.isfinite(pair.correlation)
     for name in pair.names:
@@ -268,35 +261,20 @@ def study_tables(study: Study) -> list[TextTable]:
 
 
 def _pairs_table(study: Study) -> TextTable:
-    rows = []
-    for pair in (*study.sweep.coupled, *study.sweep.turned):
-        row = [dashed(pair)]
-        for number in (pair.strongest, pair.weakest):
-            row += [correlation_text(float(number)), place(place_of(number))]
-        rows.append((*row, significant(0.5 * pair.seeds, 1)))
-    heads = ("Coupled", "Strongest", "At", "Weakest", "At", "± over seeds")
-    title = "Correlations, median over seeds; pitch, yaw and roll are those of all frames"
-    return TextTable(heads, tuple(rows), title, "lrlrlr")
+    pairs = (*study.sweep.coupled, *study.sweep.turned)
+    return table("coupled", _WRITTEN | {"place_of": place_of}, it=pairs)
 
 
 def _changes_table(study: Study) -> TextTable:
     """One row for every axis that changes a coupling, a sigma or an attitude error."""
-    changes: list[tuple[str, Curve, Callable[[float], str]]] = [
+    changes: list[Any] = [
         (dashed(p), cost, _size) for p in study.sweep.coupled for cost in p.decoupling()
     ]
     for name, sigma in sigmas(study).items():
         curves = study.sweep.curves(np.log(sigma))
         changes += [(name, curve, _sigma) for curve in curves if curve.matters]
-    names, curves, forms = zip(*changes, strict=True) if changes else ((), (), ())
-    ends = {
-        end: [
-            (form(float(c.median[i])), value_words(c.values[i]))
-            for c, form, i in zip(curves, forms, (getattr(c, end) for c in curves), strict=True)
-        ]
-        for end in ("most", "least")
-    }
-    along = [axis_label(curve.axis) for curve in curves]
-    return table("changes", name=names, it=curves, along=along, **ends)
+    columns = zip(*changes, strict=True) if changes else ((), (), ())
+    return table("changes", _WRITTEN, **dict(zip(("name", "it", "form"), columns, strict=True)))
 
 
 def _size(cost: float) -> str:
@@ -315,17 +293,14 @@ def _medians_table(study: Study) -> TextTable:
     columns, forms = summary(study)
     parts = []
     for axis in study.axes:
-        medians = {
-            head: study.sweep.over(numbers, dims=[axis]).to_series()
-            for head, numbers in columns.items()
-        }
-        part = pd.DataFrame(medians)
-        part.insert(0, "Value", [value_words(value) for value in part.index])
-        part.insert(0, "Along", [axis_label(axis), *[""] * (len(part) - 1)])
-        parts.append(part)
+        values = study.sweep.values[axis]
+        along = [axis_label(axis), *[""] * (len(values) - 1)]
+        part = {"Along": along, "Value": map(value_words, values)}
+        for head, numbers in columns.items():
+            part[head] = study.sweep.over(numbers, dims=[axis])
+        parts.append(pd.DataFrame(part))
     title = "Medians over seeds and all other axes"
-    table = pd.concat(parts) if parts else pd.DataFrame()
-    return TextTable.of(table, title, formats=forms)
+    return TextTable.of(pd.concat(parts), title, formats=forms)
 
 
 def sigmas(study: Study) -> dict[str, FloatArray]:
