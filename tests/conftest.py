@@ -26,6 +26,8 @@ import hypothesis
 import pytest
 from packaging.requirements import Requirement
 
+from starcal_uq.core import tasks
+
 ROOT = Path(__file__).resolve().parents[1]
 
 # The same examples on every run: a failure in CI is a failure at the desk.
@@ -34,10 +36,14 @@ hypothesis.settings.load_profile("repeatable")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let ArviZ 0.23 print its once-a-day notice before the test processes start.
+    """Divide the processors among the test processes: one that has a single processor starts no
+    others, each of which takes seconds to load, unless a test gives their number.
 
-    It keeps the date in one file, and two processes that write it at the same moment fail.
+    Let ArviZ 0.23 print its once-a-day notice before the test processes start: it keeps the date in
+    one file, and two processes that write it at the same moment fail.
     """
+    share = tasks.processors() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    tasks.processors = lambda: share if share > 1 else 0
     if not hasattr(config, "workerinput") and version("arviz").startswith("0."):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

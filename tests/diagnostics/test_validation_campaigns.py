@@ -18,8 +18,8 @@ COVERED = ("x0", "y0", "f", "k1", "k2", "sigma", "pitch", "yaw", "roll")
 
 @pytest.fixture(scope="module")
 def fixed():
-    """300 replicates of the paper's camera: NEES/p is known to 0.037, a coverage to 0.013."""
-    return validate(sc.paper.paper_camera(), n_replicates=300, seed=1)
+    """200 replicates of the paper's camera: NEES/p is known to 0.045, a coverage to 0.016."""
+    return validate(sc.paper.paper_camera(), n_replicates=200, seed=1)
 
 
 def calibration_ratio(found):
@@ -47,12 +47,12 @@ def test_coverage_and_squared_errors(fixed):
 
 
 def test_ranks_of_a_fixed_truth(fixed):
-    assert fixed.n_replicates == 300
+    assert fixed.n_replicates == 200
     assert (fixed.rank_p_value > 1e-3).all(), fixed.rank_p_value
 
 
 def test_ranks_of_truths_from_the_prior():
-    found = validate(sc.paper.paper_camera(), n_replicates=200, truth="prior", seed=2)
+    found = validate(sc.paper.paper_camera(), n_replicates=120, truth="prior", seed=2)
     show("truth from the prior", found)
     assert found.ok, found.text
     assert (found.rank_p_value > 1e-3).all(), found.rank_p_value
@@ -77,7 +77,7 @@ def test_biased_moves_are_found():
     sizes = {"n_walkers": 64, "n_steps": 100, "n_burn": 60, "thin": 10}
     stars = sc.load_catalogue(max_mag=6.0)
     half, without = (
-        validate_study(few_frames(moves=moves, **sizes), stars, 60)
+        validate_study(few_frames(moves=moves, **sizes), stars, 30)
         for moves in (controls.snooker_half, controls.evolution)
     )
     print(f"excess {excess(half):.3f}, without {excess(without):.3f}")

@@ -84,11 +84,11 @@ def test_tails_and_errors_of_the_stars_go_together():
 
 @pytest.mark.slow
 def test_intervals_of_parts_together_hold():
-    """Of 16 campaigns; the control has the tails alone."""
+    """Of 16 campaigns; the control, of 8 of them, has the tails alone."""
     z, plain = [], []
     for seed in range(16):
         c, obs, camera = starred(100 + seed)
-        for kept, parts in ((z, ["star"]), (plain, [])):
+        for kept, parts in ((z, ["star"]), (plain, []))[: 1 + (seed < 8)]:
             cal = sc.calibrate(obs, camera, effects=["tails", *parts])
             kept.append((cal.theta - c.theta) / cal.sigmas)
     coverage, control = (np.mean(np.abs(np.array(kept)) < 1.96) for kept in (z, plain))

@@ -197,13 +197,15 @@ def test_save_and_load_lose_nothing(study, tmp_path):
 
 @pytest.fixture(scope="module")
 def whole():
-    """Fewer points than by default, and more replicates."""
+    """Fewer points and frames than by default, and more replicates; by another process."""
     return interaction_study(
         distortion_scales=(0.0, 0.01, 0.1, 1.0, 4.0),
         fields_deg=(5.0, 10.0, 40.0),
-        frames=(10, 100, 300),
+        frames=(10, 50, 300),
         max_mags=(5.0, 6.0, 7.0),
         n_replicates=16,
+        n_frames=50,
+        workers=1,
     )
 
 
@@ -212,7 +214,7 @@ def test_ignoring_and_decoupling_cost_more_than_noise(whole):
     print(whole.text)
     for method in BIASED:
         t = whole.threshold("distortion", method, "f")
-        # A hundredth of a pixel at the corner, for a hundred frames.
+        # A hundredth of a pixel at the corner, for fifty frames.
         assert t.side == "above" and 0.005 < t.value < 0.05
         assert t.low < t.value < t.high
         for axis in ("field", "frames", "stars"):

@@ -313,10 +313,10 @@ def test_accuracy_over_the_field(found):
 
 @pytest.fixture(scope="module")
 def many():
-    """120 data sets of a hundred frames, by every method: a spread is known to 6.5 %, a bias to a
+    """120 data sets of fifty frames, by every method: a spread is known to 6.5 %, a bias to a
     tenth of it.
     """
-    return replicate(n_replicates=120, n_frames=100)
+    return replicate(n_replicates=120, n_frames=50, workers=1)
 
 
 @pytest.mark.slow

@@ -533,7 +533,7 @@ def test_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_what_comes_out_and_what_does_not(tmp_path: Path) -> None:
-    found = command.reproduce(tmp_path / "out", n_replicates=12, study=False)
+    found = command.reproduce(tmp_path / "out", n_replicates=8, study=False)
     outcomes = {
         (one.printed.method, one.printed.quantity, one.printed.place): one.outcome
         for one in found.judged

@@ -324,25 +324,24 @@ def test_every_figure_is_drawn_into_that_of_the_user(monkeypatch, tmp_path):
         initialise(self, *args, **options)
 
     monkeypatch.setattr(Figure, "__init__", counted)
+    monkeypatch.setattr("starcal_uq.paper.reproduction.N_READING_DRAWS", 2)
     results, n_drawn = {}, 0
     for scene in (scene for scene in SCENES if scene.drawn):
         exec(scene.code, results)
-        for (name, (_, _, code)), layout in itertools.product(
-            scene.figures.items(), (None, "constrained")
-        ):
-            whole = Figure(figsize=(14.0, 7.0), layout=layout)
+        for name, (_, _, code) in scene.figures.items():
+            whole = Figure(figsize=(14.0, 7.0))
             other, own = whole.subfigures(1, 2)
             made.clear()
             call = ast.parse(code, mode="eval")
             call.body.keywords.append(ast.keyword("fig", ast.Name("own", ast.Load())))
             compiled = compile(ast.fix_missing_locations(call), name, "eval")
             drawn = eval(compiled, {**results, "own": own})
-            whole.canvas.draw()
+            whole.draw_without_rendering()
             assert (drawn if isinstance(drawn, type(own)) else drawn.figure) is own, name
             assert own.axes and not other.axes and not made, name
             assert not pyplot.get_fignums(), name
             n_drawn += 1
-    assert n_drawn > 60
+    assert n_drawn > 30
 
 
 def test_every_name_of_the_table_of_looks_is_found_and_used():
