@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -90,10 +90,8 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
         if not entry.rule_arcsec > 0.0:
             _write(ax, left, at, NOT_ASSESSED)
             continue
-        ax.plot(entry.rule_arcsec, at, "o", color=style.INK, markersize=7)
-        ax.plot(
-            entry.sampled_arcsec, at, "D", color="white", markeredgecolor=style.INK, markersize=4.2
-        )
+        ax.plot(entry.rule_arcsec, at, **style.look("by the rule"))
+        ax.plot(entry.sampled_arcsec, at, **style.look("by sampling"))
         least = "≥ " if entry.at_least else ""
         mine = [
             outcome.requirement.limit_arcsec
@@ -148,29 +146,12 @@ def _write(
     style.note(ax, text, (x, y), (shift, 0), **look)
 
 
-def _handles(budget: Budget) -> list[object]:
-    from matplotlib.patches import Patch
-
+def _handles(budget: Budget) -> list[Any]:
     tested = any(row.with_misfit_found_arcsec >= 0.0 for row in budget.rows)
-    handles: list[object] = [
-        Patch(
-            facecolor=style.SKY,
-            label=f"from the posterior, {WITH_MISFIT_FOUND if tested else IF_MODEL_HOLDS}",
-        ),
-        Patch(facecolor=style.ORANGE, label="from the budget file"),
-        Patch(facecolor=style.GREY, hatch="///", edgecolor="white", label="absorbed by alignment"),
-        style.key("total by the rule", style.INK, marker="o", linestyle="", markersize=7),
-        style.key(
-            "total by sampling",
-            "white",
-            marker="D",
-            linestyle="",
-            markeredgecolor=style.INK,
-            markersize=4.2,
-        ),
-    ]
+    handles = style.keys("budget")
+    handles[0].set_label(f"from the posterior, {WITH_MISFIT_FOUND if tested else IF_MODEL_HOLDS}")
     if budget.comparable:
-        handles.append(style.key("limit", style.GREEN, linewidth=2.4))
+        handles += style.keys("limit")
     if any(outcome.verdict == "violated" for outcome in budget.comparable):
-        handles.append(style.key("limit, violated", style.VERMILLION, linewidth=2.4))
+        handles += style.keys("violated")
     return handles

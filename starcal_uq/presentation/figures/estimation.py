@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-_PATH: AnyDict = {"marker": "o", "markersize": 3.2, "linewidth": 1.2}
-_REFERENCE: AnyDict = {"linewidth": 1.0, "dashes": (4, 2)}
 _BANDS = ("#eef3f7", "#ffffff")
 
 
@@ -51,14 +49,14 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
             factor, unit = pixel_um / 1000.0, "mm"
         for ax in (upper, lower):
             _mark_stages(ax, starts, len(values))
-        upper.plot(iteration, values[:, i] * factor, color=style.BLUE, **_PATH)
-        upper.axhline(reference[i] * factor, color=style.VERMILLION, **_REFERENCE)
+        upper.plot(iteration, values[:, i] * factor, **style.look("iterations"))
+        upper.axhline(reference[i] * factor, **style.look("reference"))
         style.heading(upper, f"{symbol(parameter.name)} [{unit}]", pad=16)
         upper.ticklabel_format(axis="y", useOffset=False, style="plain")
         error = (values[:, i] - reference[i]) / cal.sigmas[i]
-        lower.axhspan(-1.0, 1.0, color=style.GREEN, alpha=0.2, linewidth=0)
-        lower.axhline(0.0, color=style.VERMILLION, **_REFERENCE)
-        lower.plot(iteration, error, color=style.BLUE, **_PATH)
+        lower.axhspan(-1.0, 1.0, **style.look("one sigma"))
+        lower.axhline(0.0, **style.look("reference"))
+        lower.plot(iteration, error, **style.look("iterations"))
         decades = max(1.0, np.ceil(np.log10(max(np.abs(error).max(), 2.0))))
         style.signed_log(lower.yaxis, 1.0, 10.0 ** (decades + 0.15), linscale=0.6)
         style.label(lower, x="iteration")
@@ -70,19 +68,12 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
 
 
 def _key(figure: Figure, cal: Calibration, what: str) -> None:
-    from matplotlib.patches import Patch
-
     stages = ", ".join(f"{i} {stage.name}" for i, stage in enumerate(cal.stages, 1))
-    handles: list[object] = [
-        style.key("estimate", style.BLUE, **_PATH),
-        style.key(what, style.VERMILLION, **_REFERENCE),
-        Patch(facecolor=style.GREEN, alpha=0.2, label="within 1 sigma"),
-        style.key(f"Stages: {stages}", style.INK, linestyle="none"),
-    ]
-    size = style.LABEL_SIZE
-    style.legend_above(
-        figure, handles, loc="upper left", fontsize=size, columnspacing=1.6, handlelength=1.8
-    )
+    handles = style.keys("convergence")
+    handles[1].set_label(what)
+    handles[-1].set_label(f"Stages: {stages}")
+    look = {"columnspacing": 1.6, "handlelength": 1.8, "fontsize": style.LABEL_SIZE}
+    style.legend_above(figure, handles, loc="upper left", **look)
 
 
 def _joined(cal: Calibration) -> tuple[FloatArray, list[int]]:

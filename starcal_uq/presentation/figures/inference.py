@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.formatting import pretty_unit
-from starcal_uq.core.types import AnyDict, FloatArray, floats
+from starcal_uq.core.formatting import plural, pretty_unit
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import AxisScale, axis_scale, symbol
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.result import Calibration
@@ -140,8 +139,7 @@ def _ellipses(ax: Axes, gaussian: tuple[FloatArray, FloatArray], i: int, j: int)
 
 def _mark(ax: Axes, x: float | None, y: float | None) -> None:
     if x is not None and y is not None:
-        look: AnyDict = {"marker": "+", "markersize": 9, "markeredgewidth": 1.8}
-        ax.plot([x], [y], color=style.VERMILLION, linestyle="none", **look)
+        ax.plot([x], [y], **style.look("truth cross"))
 
 
 def _ticks(
@@ -167,33 +165,21 @@ def _ticks(
 
 
 def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> None:
-    from matplotlib.patches import Patch
-
-    handles: list[Patch | Line2D] = [
-        Patch(facecolor=fill, edgecolor=style.BLUE, label=words)
-        for fill, words in (
-            (_FILLS[1], "39 % of the draws (1 sigma)"),
-            (_FILLS[0], "86 % of the draws (2 sigma)"),
-        )
-    ]
+    handles = style.keys("corner")
     if gaussian:
-        handles.append(style.key("Gaussian approximation", style.INK, dashes=(4, 2), linewidth=1.0))
+        handles += style.keys("gaussian")
     if truth:
-        handles.append(_truth_key(marker="+", markersize=9))
+        handles += style.keys("truth cross")
     figure.legend(
         handles=handles,
         loc="upper right",
         fontsize=style.LABEL_SIZE,
         frameon=False,
         labelcolor=style.INK,
-        title=f"{n_draws:,} draws".replace(",", " "),
+        title=plural(n_draws, "draw"),
         title_fontsize=style.LABEL_SIZE,
         alignment="left",
     )
-
-
-def _truth_key(**look: Any) -> Line2D:
-    return style.key("truth of the simulation", style.VERMILLION, linewidth=1.3, **look)
 
 
 def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure:
@@ -213,7 +199,7 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         upper = style.dress(figure.add_subplot(grid[0, i]))
         wide = _prior_grid(post.priors, name, columns[i], scales[i])
         density = _relative_prior(post.priors, name, wide)
-        upper.plot(wide / parameter.scale, density, color=style.GREEN, **_PRIOR)
+        upper.plot(wide / parameter.scale, density, **style.look("prior"))
         upper.axvline(
             _centre(columns[i], scales[i]) / parameter.scale, color=style.BLUE, linewidth=1.5
         )
@@ -226,14 +212,15 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         near = np.linspace(*ends, 60)
         height = _relative_prior(post.priors, name, near * scales[i].factor + scales[i].reference)
         # The prior's own density in this unit would lie on the axis: only its slope can be shown.
-        lower.plot(near, 0.5 * height, color=style.GREEN, **_PRIOR)
+        lower.plot(near, 0.5 * height, **style.look("prior"))
         lower.set_xlim(*ends)
         style.label(lower, x=scales[i].label, size=style.TICK_SIZE)
         sparse(lower, y=False)
         if i == 0:
             style.label(upper, y="scale of\nthe prior")
             style.label(lower, y="scale of\nthe posterior")
-    _prior_key(figure, truth is not None)
+    handles = style.keys("prior") + (style.keys("truth") if truth is not None else [])
+    style.legend_above(figure, handles, loc="upper left", fontsize=style.LABEL_SIZE)
     return figure
 
 
@@ -260,21 +247,10 @@ def _centre(column: FloatArray, scale: AxisScale) -> float:
     return float(np.mean(column) * scale.factor + scale.reference)
 
 
-def _prior_key(figure: Figure, truth: bool) -> None:
-    handles = [
-        style.key("prior (below: its slope only)", style.GREEN, **_PRIOR),
-        style.key("posterior", style.BLUE, linewidth=1.5),
-    ]
-    if truth:
-        handles.append(_truth_key())
-    style.legend_above(figure, handles, loc="upper left", ncols=3, fontsize=style.LABEL_SIZE)
-
-
 def _unit(text: str) -> str:
     return f"[{pretty_unit(text)}]" if pretty_unit(text) else ""
 
 
-_PRIOR: AnyDict = {"linewidth": 1.5, "dashes": (4, 1.5)}
 BINS = 44
 HALF_WIDTH_SD = 3.6
 # Share of an axis at either end without ticks: about half a label.

@@ -268,13 +268,8 @@ def plot_thermal(error: ThermalError) -> Figure:
     style.band(above, time[[0, -1]], error.lowest_c, error.highest_c, style.SKY, alpha=0.35)
     above.plot(time, error.profile.temperature_c, color=style.INK, lw=1.4)
     above.axhline(error.aligned_c, color=style.VERMILLION, lw=1.0, ls=":")
-    words = (
-        style.key("temperature", style.INK),
-        style.key("seen by the calibration", style.SKY, lw=6.0, alpha=0.35),
-        style.key("at alignment", style.VERMILLION, ls=":"),
-    )
-    style.legend_on_top(above, handles=words, columnspacing=1.4)
-    style.label(above, "", "", "temperature\n[°C]")
+    style.legend_on_top(above, handles=style.keys("temperature"), columnspacing=1.4)
+    style.named(above, "temperature")
     for sizes, look, aboard in (
         (error.model_arcsec, "-", "model"),
         (error.effects_arcsec, "--", "effects"),
