@@ -108,10 +108,11 @@ class Remedy:
     @property
     def words(self) -> str:
         """What to type or to call, in a sentence of its own: as the command line has it while it
-        runs.
+        runs, and a call where what it needs may be in memory alone.
         """
-        speak = _speakers[-1] if _speakers else None
-        return self.command or self.call if speak is None else speak(self)
+        if _speakers:
+            return _speakers[-1](self)
+        return (OBS in self.files and self.call) or self.command or self.call
 
     def __str__(self) -> str:
         return f"run `{self.words}` {self.purpose}".rstrip()

@@ -21,6 +21,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.conflicts import asked, refuse_conflicts, with_effects, words_of
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError, SettingError
 from starcal_uq.core.manifest import identity
+from starcal_uq.core.remedy import OBS, Remedy, spoken
 from starcal_uq.core.settings import (
     Bayer,
     Directions,
@@ -416,7 +417,7 @@ def run(
         weakref.finalize(made, shutil.rmtree, place.parent, ignore_errors=True)
     watch = Watch(made._tell)
     start = options.pop("start", {})
-    with made.making(record, force=force, words=words):
+    with spoken(partial(_as_call, settings)), made.making(record, force=force, words=words):
         if not (made.did("calibrate") and (made.did("images") or not images)):
             calibrate_source(
                 made,
@@ -431,6 +432,17 @@ def run(
         # Other processes would start the script of the user once more.
         finish(made, Ahead(), options, seed=seed, watch=watch, report=out is not None)
     return made
+
+
+def _as_call(settings: AnyMapping, remedy: Remedy) -> str:
+    """What to call; of another calibration, this run with what it needs besides."""
+    if remedy.action != "calibrate" or OBS not in remedy.files:
+        return remedy.command or remedy.call
+    needed = remedy.options
+    if "effects" in needed:
+        needed["effects"] = joined_effects(settings.get("effects"), needed["effects"])
+    given = ", ".join(f"{name}={value!r}" for name, value in needed.items())
+    return f"sc.run(source, camera, ..., {given})"
 
 
 def kind_of(source: Any) -> tuple[bool, bool]:

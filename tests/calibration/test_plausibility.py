@@ -176,7 +176,8 @@ def test_wrong_stars_and_noise_are_told_apart(field):
     c = seen(field)
     half = sc.Observations(**(c.columns | wrong_share(c, 0.5)))
     with pytest.raises(
-        CalibrationError, match=r"about (4|5)\d % of the stars do not fit the others .* --screen"
+        CalibrationError,
+        match=r"about (4|5)\d % of the stars do not fit the others .*calibration\.screen",
     ):
         sc.calibrate(half, sheet(c))
     most = sc.Observations(**(c.columns | wrong_share(c, 0.9)))

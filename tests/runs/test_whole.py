@@ -7,12 +7,14 @@ import sys
 from contextlib import nullcontext
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import starcal_uq as sc
 from starcal_uq.cli.app import main
 from starcal_uq.cli.schemas import document
 from tests.cli.conftest import check_document
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
 
 FEW = {"n_steps": 20, "n_draws": 50, "n_ensembles": 2}
@@ -124,3 +126,20 @@ def test_settings_that_make_no_sense_are_refused_in_one_sentence(few, settings, 
     with pytest.raises(sc.StarcalError, match=words) as refused:
         sc.run(few, **given)
     assert "\n" not in str(refused.value)
+
+
+def test_a_call_that_fails_names_a_call_and_that_call_works():
+    # The command line cannot name stars that are in memory alone.
+    seen = campaign(np.random.default_rng(3), n_frames=20, stars_per_frame=15)
+    stars, wrong = pd.DataFrame(seen.columns), slice(0, 300, 20)
+    pixels = stars.loc[wrong, ["x_px", "y_px"]].to_numpy()
+    stars.loc[wrong, ["x_px", "y_px"]] = pixels[::-1]
+    camera = sc.Camera.from_dict(seen.camera_toml())
+    with pytest.raises(sc.errors.CalibrationError) as failed:
+        sc.run(stars, camera, **FEW, effects="none")
+    assert "`sc.run(source, camera, ..., screening=True)`" in str(failed.value)
+    screened = sc.run(stars, camera, **FEW, effects="none", screening=True)
+    assert screened.calibration.status.name == "CONVERGED"
+    with pytest.raises(sc.errors.CalibrationError) as failed:
+        sc.calibrate(sc.Observations.from_dataframe(stars, camera=camera), camera)
+    assert "`sc.calibration.screen(obs, camera)`" in str(failed.value)
