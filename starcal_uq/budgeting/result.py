@@ -54,7 +54,7 @@ class Outcome(Shown):
 
     @property
     def bound_arcsec(self) -> float:
-        """What is held against the limit: by the rule, by sampling, or the larger of both.
+        """Bound that is compared with the limit: by the rule, by sampling, or the larger of both.
 
         NaN if it is not known. The larger of both is at least the rule, which is enough where that
         violates the limit.

@@ -2,7 +2,7 @@
 
 A frame tells its focal length by itself, through the angles between its stars. Frames of one camera
 scatter around one value, by noise and by what the model leaves over; those of two, around two. The
-split of the sorted values that leaves the least scatter within is held against the same of as many
+split of the sorted values that leaves the least scatter within is compared with that of as many
 values of one camera.
 """
 
@@ -37,7 +37,7 @@ _LEAST_FRAMES, _LEAST_STARS, _FRAMES, _DRAWS, _STEPS = 4, 4, 300, 4000, 6
 _MOST_AT_ONCE = 4
 # What the frames say of cameras.
 Mixed = Enum("Mixed", "CAMERAS")
-# Of the sample of frames, and of the draws that a split is held against.
+# Of the sample of frames, and of the draws that a split is compared with.
 _SEED = 0
 
 

@@ -119,7 +119,8 @@ def usage_sentence(error: Exception) -> str:
         return f"{option} is no option any more: give --effects {EARLIER[option]} in its place."
     form = getattr(error, "format_message", None)
     message = form() if callable(form) else str(error)
-    return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
+    name = f" {context.command.name}" if context is not None and context.parent else ""
+    return f"{message.strip().rstrip('.')}; see `starcal-uq{name} --help`."
 
 
 def _is_typed(parameter: Any) -> bool:

@@ -137,6 +137,14 @@ def print_table(table: TextTable) -> None:
         max((len(word) for cell in column for word in cell.split()), default=1)
         for column in columns
     ]
+    words = table.align.index("r") if "r" in table.align else len(least)
+    if sum(least) + len(least) - 1 > out.width and len(least) > words + 1:
+        # Numbers are not broken: the rest of the columns follows beside the words once more.
+        half = (words + len(least) + 1) // 2
+        heads = table.heads
+        print_table(table.part(heads[:half], table.title))
+        print_table(table.part((*heads[:words], *heads[half:]), ""))
+        return
     wide = sum(least) + 3 * len(least) + 1 > out.width
     widths = [max(map(len, column)) for column in columns]
     gap = int(sum(least) + 2 * len(least) - 1 <= out.width)

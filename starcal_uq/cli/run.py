@@ -87,7 +87,13 @@ def run_command(
     with progress_bar("loading"):
         from starcal_uq.pipeline.images import are_images
         from starcal_uq.presentation.report.drawing import Ahead
-        from starcal_uq.runs.whole import calibrate_source, check_files, finish, kind_of
+        from starcal_uq.runs.whole import (
+            calibrate_source,
+            check_files,
+            finish,
+            kind_of,
+            refuse_no_camera,
+        )
 
     run = sc.Run(out, tell=note)
     typed: AnyDict = {"budget": budget}
@@ -110,10 +116,7 @@ def run_command(
         raise typer.BadParameter(
             f"{inputs[1]} is no image: give one table, .corr files only, or images only."
         )
-    if camera is None and not from_images:
-        raise typer.BadParameter(
-            "a table of stars needs the nominal camera (TOML) after it; only images do without."
-        )
+    refuse_no_camera(camera, from_images)
     refuse_conflicts(asked({**typed, **estimation.options()}, folder))
     options = {
         **estimation.options(),

@@ -1,4 +1,4 @@
-"""Two calibrations held against each other."""
+"""Comparison of two calibrations."""
 
 import lazy_loader
 

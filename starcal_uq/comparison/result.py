@@ -140,7 +140,7 @@ class CameraComparison(Shown):
     def verdict(self) -> str:
         """``agree``, ``maps differ``, ``parameters differ`` or ``not tested``.
 
-        Each of the two p-values is held against half the level, so that both together keep it.
+        Each of the two p-values is compared with half the level, so that both together keep it.
         """
         if not self.tested:
             return "not tested"

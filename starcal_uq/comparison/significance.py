@@ -1,4 +1,4 @@
-"""The difference of two cameras on a grid, held against the covariance that it should have."""
+"""The difference of two cameras on a grid, compared with the covariance that it should have."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def one_noise(a: Estimate, b: Estimate, rule: Rule) -> tuple[Estimate, Estimate]
 
 @dataclass(frozen=True)
 class DifferenceTests:
-    """A difference on the grid held against its covariance; NaN where that is not known.
+    """A difference on the grid compared with its covariance; NaN where that is not known.
 
     `outside` is the root mean square of what no error of the parameters explains, arcsec; `sigma`
     and `ratio` (N,) are the expected length at each point, arcsec, and the length found over it;

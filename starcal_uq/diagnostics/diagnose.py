@@ -338,7 +338,7 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
 
     One standard deviation of the starts is 5 % of the focal length and a tenth of the detector.
     Where there are many frames, a few hundred of them have the same optima: the starts are then
-    held against the optimum of these, if the estimate is as near to it as chance has it.
+    compared with the optimum of these, if the estimate is as near to it as chance has it.
     """
     rng = np.random.default_rng((seed, 11))
     nominal = cal.nominal

@@ -38,7 +38,7 @@ class MisfitTest:
     Attributes
     ----------
     name, against : str
-        Pattern that it looks for, and the quantity that the residuals are held against.
+        Pattern that it looks for, and the quantity that the residuals are compared with.
     statistic : float
         F, or the standard normal z of a test for unequal noise.
     dof, dof_residual : int

@@ -162,7 +162,7 @@ def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:
 class Profile1D:
     """Mean residuals in bins of one quantity, for two components."""
 
-    # `title`, `label`: quantity that they are held against, and the axis label with its unit.
+    # `title`, `label`: quantity that they are compared with, and the axis label with its unit.
     title: str
     label: str
     names: tuple[str, str]  # The two components

@@ -85,7 +85,7 @@ class View:
 class Shape:
     """A family of shapes that one test looks for."""
 
-    # `name`, `against`: short name, and what the residuals are held against.
+    # `name`, `against`: short name, and what the residuals are compared with.
     name: str
     against: str
     size: int  # Number of columns

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _MIN_STARS = 3
 _REPAIR = "correct or remove the row"
+# Stars that would not all be in one corner of the detector by chance.
+_MANY = 10
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d)(:\d\d(?:\.\d+)?)?(?:Z|[+-]00:?00)?")
 
 
@@ -161,9 +163,14 @@ def check_columns(
         problems += parse_times("time_utc", columns["time_utc"].tolist())[1]
     ra, dec = columns["ra_deg"], columns["dec_deg"]
     # 360 is let pass: rounding to a few decimals turns 359.99999999 into it.
-    problems += _each("ra_deg", ra, (ra < 0.0) | (ra > 360.0), "is outside 0..360 deg")
+    outside = (ra < 0.0) | (ra > 360.0)
+    problems += _each("ra_deg", ra, outside, "is outside 0..360 deg", _unit_remedy(outside))
     swapped = bool(np.all(np.abs(ra) <= 90.0) and np.all((dec >= 0.0) & (dec <= 360.0)))
-    remedy = "exchange ra_deg and dec_deg, which look swapped" if swapped else _REPAIR
+    remedy = (
+        "exchange ra_deg and dec_deg, which look swapped"
+        if swapped
+        else _unit_remedy(np.abs(dec) > 90.0)
+    )
     problems += _each("dec_deg", dec, np.abs(dec) > 90.0, "is outside -90..90 deg", remedy)
     if "sigma_px" in columns:
         sigma = columns["sigma_px"]
@@ -172,6 +179,7 @@ def check_columns(
         stated = columns["direction_mas"]
         problems += _each("direction_mas", stated, stated < 0.0, "is below 0")
     if camera is not None:
+        problems += _in_millimetres(columns, camera)
         for name, size in (("x_px", camera.width_px), ("y_px", camera.height_px)):
             values = columns[name]
             outside = (values < -0.5) | (values > size - 0.5)
@@ -182,6 +190,25 @@ def check_columns(
         # Which frame has too few stars is not known while some rows belong to none.
         return problems + _check_repeats(columns, rows[~unknown_frame])
     return problems + _check_counts(columns["frame"]) + _check_repeats(columns, rows)
+
+
+def _unit_remedy(outside: BoolArray) -> str:
+    """Not single rows are to blame where most are outside."""
+    return "check the unit of the whole column, or its factor" if outside.mean() > 0.5 else _REPAIR
+
+
+def _in_millimetres(columns: AnyMapping, camera: Camera) -> list[Problem]:
+    """Many stars, all of them in the corner that a detector in millimetres would fill."""
+    if camera.pixel_um is None or len(columns["x_px"]) < _MANY:
+        return []
+    pitch_mm = 1e-3 * camera.pixel_um
+    xy = np.column_stack([columns["x_px"], columns["y_px"]])
+    size_mm = pitch_mm * np.array([camera.width_px, camera.height_px])
+    if np.any((xy < 0.0) | (xy > size_mm)):
+        return []
+    reason = "looks like millimetres, as all values of x_px and y_px do"
+    remedy = f"divide both columns by the pixel pitch, {pitch_mm:g} mm"
+    return [Problem(0, "x_px", f"{xy[0, 0].item()!r} {reason}", remedy)]
 
 
 def _pixel_remedy(columns: AnyMapping, camera: Camera) -> str:

@@ -180,11 +180,11 @@ def check_names(
     there = {c: column_behind(own, raw.names) in raw.names for c, own in names.items()}
     missing = [c for c in names if not there[c] and (COLUMNS[c].required or c in mapping)]
     if missing:
-        wanted = names[missing[0]]
-        others = f" (so are {', '.join(names[c] for c in missing[1:])})" if missing[1:] else ""
+        wanted = ", ".join(names[c] for c in missing)
+        lacking = f"columns {wanted} are" if missing[1:] else f"column {wanted} is"
         raise ObservationError(
-            f"{path}: column {wanted} is missing{others}; {say_column(missing[0], raw.names)}.",
-            column=wanted,
+            f"{path}: {lacking} missing; {say_column(missing, raw.names)}.",
+            column=names[missing[0]],
             problems=[f"{path}: column {names[c]} is missing." for c in missing],
         )
     for name in names.values():
@@ -194,11 +194,15 @@ def check_names(
             )
 
 
-def say_column(name: str, names: Sequence[str]) -> str:
-    """How to say which of the `names` in a file is a column."""
+def say_column(missing: Sequence[str], names: Sequence[str]) -> str:
+    """How to map `missing` columns to the `names` in a file, with a guess where one begins alike."""
+    options = []
+    for name in missing:
+        near = [own for own in names if own.lower().startswith(name.split("_")[0])]
+        options.append(f'--column "{name}={near[0] if len(near) == 1 else "NAME"}"')
     return (
-        f'say which it is, as by --column "{name}=NAME" or columns={{...}}, of those in the file '
-        f"({listed(names)})"
+        f"the file has {listed(names)}: give {' '.join(options)}, or columns={{...}} in Python, "
+        "with names from the file"
     )
 
 

@@ -284,7 +284,7 @@ def _check_alike(
         own = own if name == "frame" else column_behind(own, summary.names)
         if own not in summary.names and (COLUMNS[name].required or name in reader.columns):
             raise ObservationError(
-                f"{path}: column {own} is missing; {say_column(name, summary.names)}.",
+                f"{path}: column {own} is missing; {say_column([name], summary.names)}.",
                 column=own,
             )
         if (own in summary.names) != (own in first.names):

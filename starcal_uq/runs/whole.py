@@ -464,9 +464,14 @@ def _check(options: AnyMapping, images: bool, camera: Camera | PathLike | None) 
             raise SettingError(unknown_key(name, known, "setting"))
         if name in others.__annotations__:
             raise SettingError(f"setting {name} belongs to {kind}: leave it out.")
+    refuse_no_camera(camera, images)
+
+
+def refuse_no_camera(camera: Camera | PathLike | None, images: bool) -> None:
+    """Refuse a table of stars without its camera."""
     if camera is None and not images:
         raise SettingError(
-            "a table of stars needs the nominal camera as well; only images do without."
+            "a table of stars needs the nominal camera (TOML) after it; only images do without."
         )
 
 

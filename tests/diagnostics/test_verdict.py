@@ -352,6 +352,18 @@ def test_outliers_warn_and_are_located(run):
     )
 
 
+@pytest.mark.parametrize("wrong", [(), (5, 40, 77)])
+def test_wrong_stars_that_tails_outweigh_are_named(run, wrong):
+    x = np.array(run.obs.x_px)
+    x[list(wrong)] += 30.0
+    obs = dataclasses.replace(run.obs, x_px=x)
+    cal = sc.calibrate(obs, sc.paper.paper_start(), effects="tails")
+    check = outcome("Outliers", obs, cal)
+    named = {(one["frame"], one["x_px"]) for one in check.values["beyond_tails"]}
+    assert named == {(int(obs.frame[row]), float(x[row])) for row in wrong}
+    assert ("3 stars are probably identified wrongly" in check.sentence) == bool(wrong)
+
+
 @pytest.mark.parametrize(
     ("sigma", "level"), [(0.05, Level.PASS), (2.0, Level.WARN), (0.0001, Level.WARN)]
 )

@@ -452,11 +452,13 @@ def test_missing_columns(tmp_path):
     path = write_csv(tmp_path / "obs.csv", [row[:3] for row in ROWS], ["frame", "x_px", "why"])
     error = caught(path)
     assert str(error) == (
-        f"{path}: column y_px is missing (so are ra_deg, dec_deg); say which it is, as by "
-        '--column "y_px=NAME" or '
-        "columns={...}, of those in the file (frame, x_px, why)."
+        f"{path}: columns y_px, ra_deg, dec_deg are missing; the file has frame, x_px, why: give "
+        '--column "y_px=NAME" --column "ra_deg=NAME" --column "dec_deg=NAME", or columns={...} in '
+        "Python, with names from the file."
     )
     assert (error.row, error.column, len(error.problems)) == (None, "y_px", 3)
+    near = write_csv(tmp_path / "near.csv", [row[:3] for row in ROWS], ["frame", "Xpix", "RA"])
+    assert '--column "x_px=Xpix" --column "y_px=NAME" --column "ra_deg=RA"' in str(caught(near))
     twice = write_csv(tmp_path / "twice.csv", [[*row, "1"] for row in ROWS], [*HEADER, "x_px"])
     assert "column x_px occurs twice" in str(caught(twice))
 
@@ -520,10 +522,15 @@ def test_columns_that_look_exchanged_are_said_so():
         {"x_px": 0.6 * good["x_px"], "y_px": good["y_px"]},
     )
     far = {"x_px": np.append(good["x_px"][:-1], 5000.0)}
+    pitch_mm = 1e-3 * sheet.pixel_um
+    millimetres = {"x_px": pitch_mm * good["x_px"], "y_px": pitch_mm * good["y_px"]}
+    hours_twice = {"ra_deg": 15.0 * good["ra_deg"]}
     for columns, used, words in (
         (swapped, sheet, "exchange ra_deg and dec_deg, which look swapped"),
         (tall, wide, "exchange x_px and y_px, which look swapped"),
         (far, sheet, "check the camera file"),
+        (millimetres, sheet, f"divide both columns by the pixel pitch, {pitch_mm:g} mm"),
+        (hours_twice, sheet, "check the unit of the whole column, or its factor"),
         (
             {"dec_deg": np.where(good["frame"] == 0, 95.0, good["dec_deg"])},
             sheet,

@@ -100,7 +100,10 @@ def test_columns_by_other_names_and_a_time_of_all_rows(frame):
         (lambda frame: frame.drop(columns="dec_deg"), "table: column dec_deg is missing"),
         (lambda frame: frame.assign(ra_deg=400.0), "table, row 1, column ra_deg: 400.0 is outside"),
         (lambda frame: frame.assign(x_px="left"), "table, row 1, column x_px: 'left' is not a num"),
-        (lambda frame: with_units(frame)["x_px", "y_px"], "column frame is missing"),
+        (
+            lambda frame: with_units(frame)["x_px", "y_px"],
+            "columns frame, ra_deg, dec_deg are missing",
+        ),
         (lambda frame: QTable({**with_units(frame), "x_px": np.ones(8) * u.s}), "has the unit 's'"),
         (lambda frame: 5, "table: is not a readable table"),
     ],

@@ -619,6 +619,20 @@ def test_a_table_that_just_fits_the_terminal_keeps_its_last_column(monkeypatch, 
     assert "0.0231" in capsys.readouterr().out
 
 
+def test_numbers_of_a_table_that_is_too_wide_are_never_broken(monkeypatch, capsys):
+    from rich.console import Console
+
+    from starcal_uq.cli import console
+    from starcal_uq.presentation.tables import TextTable
+
+    heads = ("Along", "Value", *(f"unit{i}" for i in range(12)))
+    row = ("temperatures", "20", *(f"0.{i:02}1234" for i in range(12)))
+    monkeypatch.setattr(console, "out", Console(width=80))
+    console.print_table(TextTable(heads, (row,), align="ll" + "r" * 12))
+    words = capsys.readouterr().out.split()
+    assert set(heads) | set(row) <= set(words)
+
+
 def test_part_of_a_table_takes_the_first_of_two_columns_of_one_name():
     from starcal_uq.presentation.tables import TextTable
 

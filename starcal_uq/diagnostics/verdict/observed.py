@@ -50,6 +50,8 @@ ABERRATION_RAD = 9.94e-5
 PLAUSIBLE_NOISE_PX = (0.003, 0.5)
 PLAUSIBLE_SCALE = (0.7, 1.5)
 PATTERN_P, OUTLIER_P = 1e-3, 1e-3
+# Probability that right stars alone have one that their fitted tails do not explain.
+TAILS_P = 0.05
 COVERED_SHARE = 0.85
 # Stated noise that is magnitudes: a small factor on it, its range, and what it stays below.
 _FAR_BELOW, _MAGNITUDES = 0.2, (1.5, 20.0)
@@ -300,7 +302,31 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     p_value = 1.0 if found == 0 else float(pdtrc(found - 1, expected))
     facts = {"n_beyond": found, "largest_sigma": largest, "frame": frame, "p_value": p_value}
     facts |= {"beyond_sigma": OUTLIER_SIGMA, "expected": expected}
+    facts["beyond_tails"] = _beyond_tails(obs, cal)
     return judged(Code.OUTLIERS, facts, {"p_value_least": OUTLIER_P}, SCREEN)
+
+
+def _beyond_tails(obs: Observations, cal: Calibration) -> list[AnyDict]:
+    """Stars that even the fitted tails do not explain, the farthest first.
+
+    Their weights are (nu + 2) / (nu + r^2), so that a residual of r scales has the probability
+    (1 + r^2 / nu)^(-nu / 2). Weighted residuals of any star stay below sqrt(nu + 2).
+    """
+    record, weights = cal.provenance.student_t, cal.star_weights
+    if not record or cal.partitions is not None:
+        return []
+    nu = float(record["dof"])
+    if weights is None:
+        weights = (nu + 2.0) / (nu + np.sum(normalised_residuals(cal, obs) ** 2, axis=1))
+    beyond = obs.n_stars * (nu / (nu + 2.0) * weights) ** (0.5 * nu) < TAILS_P
+    distance = np.hypot(*cal.residuals_px.T)
+    rows = sorted(np.flatnonzero(beyond), key=lambda row: -distance[row])
+    names = obs.star_id if obs.star_id is not None else np.full(obs.n_stars, "")
+    return [
+        {"frame": int(obs.frame[i]), "star": str(names[i]), "x_px": float(obs.xy[i, 0]),
+         "y_px": float(obs.xy[i, 1]), "residual_px": float(distance[i])}
+        for i in rows
+    ]  # fmt: skip
 
 
 def screening(obs: Observations) -> Check | None:

@@ -35,7 +35,7 @@ def plot_budget(budget: Budget) -> Figure:
     interpretation), in two panels.
 
     Contributors that nobody assessed are counted below, for nothing drawn would read as zero.
-    Limits are drawn of requirements that the totals may be held against: at the budget's
+    Limits are drawn of requirements that the totals may be compared with: at the budget's
     confidence, and mixed.
     """
     names = list(dict.fromkeys(row.name for row in budget.rows if row.assessed))
