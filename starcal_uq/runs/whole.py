@@ -519,6 +519,12 @@ def _words(files: list[Path], camera: Any, options: AnyMapping) -> tuple[str, ..
         if name == "columns":
             typed["column"] = tuple(f"{key}={in_file}" for key, in_file in (value or {}).items())
             continue
+        if name == "start":
+            value = ",".join(f"{key}={float(own)!r}" for key, own in value.items())
+        elif name == "frames" and value is not None:
+            value = ",".join(f"{first}-{last}" for first, last in value)
+        elif name == "observer_velocity_km_s" and value is not None:
+            value = ",".join(repr(float(part)) for part in value)
         if not isinstance(value, bool | int | float | str | None):
             return ()
         if value not in (None, False, 0):

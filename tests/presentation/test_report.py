@@ -619,6 +619,15 @@ def test_a_table_that_just_fits_the_terminal_keeps_its_last_column(monkeypatch, 
     assert "0.0231" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unpainted")
+def test_figures_of_a_report_do_not_appear_below_the_cell_of_a_notebook(monkeypatch, full):
+    from matplotlib import pyplot
+
+    monkeypatch.setattr("starcal_uq.presentation.figures.style._in_notebook", lambda: True)
+    assert draw_figures(sc.Run(full.path).results, ["attitude", "glance_attitude"])
+    assert pyplot.get_fignums() == []
+
+
 def test_numbers_of_a_table_that_is_too_wide_are_never_broken(monkeypatch, capsys):
     from rich.console import Console
 

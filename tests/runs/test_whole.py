@@ -13,6 +13,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.cli.app import main
 from starcal_uq.cli.schemas import document
+from starcal_uq.runs import whole
 from tests.cli.conftest import check_document
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
@@ -90,6 +91,19 @@ def test_a_run_is_shown_by_its_verdict_and_kept_as_long_as_it_is_asked_for(few, 
     del run
     gc.collect()
     assert not place.parent.exists()
+
+
+def test_start_frames_and_velocity_are_options_of_the_command_that_repeats_a_run(tmp_path):
+    settings = {
+        "start": {"focal_px": 2500.123456789},
+        "frames": [(0, 4), (7, 7)],
+        "observer_velocity_km_s": (7.5, 0, -1),
+    }
+    words = whole._words([tmp_path / "obs.csv"], tmp_path / "camera.toml", settings)
+    expected = (
+        "--start focal_px=2500.123456789 --only-frames 0-4,7-7 --observer-velocity 7.5,0.0,-1.0"
+    )
+    assert " ".join(words[3:]) == expected
 
 
 @pytest.mark.slow

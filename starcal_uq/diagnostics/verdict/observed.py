@@ -300,7 +300,12 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     expected = n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
     # Probability of at least `found` where `expected` are expected (Poisson).
     p_value = 1.0 if found == 0 else float(pdtrc(found - 1, expected))
-    facts = {"n_beyond": found, "largest_sigma": largest, "frame": frame, "p_value": p_value}
+    facts: AnyDict = {
+        "n_beyond": found,
+        "largest_sigma": largest,
+        "frame": frame,
+        "p_value": p_value,
+    }
     facts |= {"beyond_sigma": OUTLIER_SIGMA, "expected": expected}
     facts["beyond_tails"] = _beyond_tails(obs, cal)
     return judged(Code.OUTLIERS, facts, {"p_value_least": OUTLIER_P}, SCREEN)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import tomllib
 from collections.abc import Callable, Collection
 from concurrent.futures import BrokenExecutor, Executor, Future
@@ -41,6 +42,8 @@ def draw_figures(
         figure = _figure(results, name)
         if figure is not None:
             drawn[name] = svg_bytes(figure)
+            if (pyplot := sys.modules.get("matplotlib.pyplot")) is not None:
+                pyplot.close(figure)  # A notebook would show it below the cell.
         if progress is not None:
             progress(done + 1, len(names))
     return drawn
