@@ -733,8 +733,6 @@ def test_a_missing_part_is_named_with_its_command(full: Any, tmp_path: Path) -> 
     (tmp_path / "run" / "budget.csv").unlink(missing_ok=True)  # other tests may have made one
     with pytest.raises(RunFolderError, match="starcal-uq propagate RUN"):
         sc.Run(tmp_path / "run").budget()
-    with pytest.raises(BudgetError, match="does not exist"):
-        sc.Run(full.path).budget(file=tmp_path / "none.toml", force=True)
 
 
 def test_rows_of_the_posterior_to_every_field() -> None:

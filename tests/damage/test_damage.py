@@ -49,7 +49,7 @@ IN_PART = {"budget.toml", "kernel.ti", "profile.csv", "orbit.csv", "hip_main.dat
 
 
 @pytest.mark.parametrize("name", BY_FILE)
-def test_a_file_that_is_empty_cut_or_not_there_is_refused_in_one_sentence(
+def test_a_file_that_is_empty_cut_not_there_or_a_folder_is_refused_in_one_sentence(
     bench: Bench, name: str
 ) -> None:
     sample = BY_FILE[name]
@@ -60,6 +60,11 @@ def test_a_file_that_is_empty_cut_or_not_there_is_refused_in_one_sentence(
     path.unlink()
     # Where there is no record of a run, there is no run yet.
     assert judge(sample, path).kind == ("other" if name == "run.json" else "refused")
+    path.mkdir()
+    folder = judge(sample, path)
+    # Permissions are the reason that the system would give on some machines.
+    assert folder.kind == "refused" and "check its permissions" not in folder.detail, folder
+    path.rmdir()
 
 
 @pytest.mark.slow

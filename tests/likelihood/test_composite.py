@@ -342,8 +342,10 @@ def test_godambe_is_the_covariance_of_the_pair_estimate() -> None:
         normal = objective.evaluate(estimate)
         estimate = estimate - symmetric_inverse(normal.matrix) @ normal.gradient
         errors.append(estimate - truth.theta)
-        predicted.append(expected_godambe(objective, estimate, 0.05))
-        naive.append(inverse * normal.cost / objective.n_pairs)
+        # Predictions differ by per cents: the mean of a few is known better than the scatter of all.
+        if seed < 60:
+            predicted.append(expected_godambe(objective, estimate, 0.05))
+            naive.append(inverse * normal.cost / objective.n_pairs)
     sampled, godambe = np.cov(np.array(errors).T), np.mean(predicted, axis=0)
     correlation = godambe / np.sqrt(np.outer(np.diag(godambe), np.diag(godambe)))
     matters = np.abs(correlation) > 0.5
