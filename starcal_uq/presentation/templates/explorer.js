@@ -170,7 +170,7 @@
     const long = Math.max(...axis.values.map((value) => value.length)), every = numeric ? Math.ceil(n * long * 7 / (right - left)) : 1;
     axis.values.forEach((value, i) => {
       if (i !== n - 1 && (i % every || i && n - 1 - i < every)) return;
-      const short = value.length > 20 ? `${value.slice(0, 19)}…` : value, reach = 3 * short.length;
+      const short = value.length > 20 ? `${value.slice(0, 19)}…` : value, reach = 3.5 * short.length;
       const middle = Math.max(reach, Math.min(420 - reach, x(i)));
       make("text", svg, { x: middle, y: bottom + 16 + (numeric ? 0 : 12 * (i % 2)), "text-anchor": "middle" }, short);
     });

@@ -298,18 +298,20 @@ def contributors_table(budget: Budget) -> TextTable:
 
 def totals_table(budget: Budget) -> TextTable:
     """One row per scope and axis, in the mixed interpretation."""
-    heads = ("scope", "axis", "sigma", "rule", "sampled")
-    rows = tuple(tuple(row[name] for name in heads) for row in total_rows(budget))
     title = f"Totals at {confidence_text(budget.confidence)}, mixed interpretation, arcsec"
-    return TextTable(heads, rows, title, "lllll")
+    return _bounds("scope", total_rows(budget), title)
+
+
+def _bounds(first: str, rows: list[Row], title: str) -> TextTable:
+    heads = (first, "axis", "sigma", "rule", "sampled")
+    cells = tuple(tuple(row[name] for name in heads) for row in rows)
+    return TextTable(heads, cells, title, "lllll")
 
 
 def indices_table(budget: Budget) -> TextTable:
     """One row per error index and axis after alignment, in the mixed interpretation."""
-    heads = ("index", "axis", "sigma", "rule", "sampled")
-    rows = tuple(tuple(row[name] for name in heads) for row in index_rows(budget))
     title = f"Error indices at {confidence_text(budget.confidence)} after alignment, arcsec"
     taken = dict.fromkeys(name for entry in budget.index_totals for name in entry.at_most)
     if taken:
         title += f"; at most, as their behaviour in time is not stated: {join_words([*taken])}"
-    return TextTable(heads, rows, title, "lllll")
+    return _bounds("index", index_rows(budget), title)
