@@ -447,8 +447,7 @@ def _squared_residuals(
         total += residual * residual
     if w is not None:
         total *= w
-    result: FloatArray = np.add.reduceat(total, local, axis=-1)
-    return result
+    return np.add.reduceat(total, local, axis=-1)
 
 
 def aligned(

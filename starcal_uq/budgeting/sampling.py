@@ -104,8 +104,7 @@ def _joint(rows: Sequence[Contributor], name: str, n_samples: int, seed: int) ->
     values, vectors = principal(matrix, 0.0)
     index = next(place for place, row in enumerate(rows) if row.name == name)
     plain = np.random.default_rng((seed, 1, index)).standard_normal((n_samples, 3))
-    deviate: FloatArray = (vectors * np.sqrt(values)) @ vectors.T @ plain.T
-    return deviate
+    return (vectors * np.sqrt(values)) @ vectors.T @ plain.T
 
 
 def one_of_many(rest: FloatArray, chance: FloatArray, confidence: float) -> float:

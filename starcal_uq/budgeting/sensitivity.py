@@ -69,8 +69,7 @@ class BudgetSensitivities:
     def of(self, name: str, axis: str, scope: str = SCOPES[1], index: str = "AKE") -> pd.Series:
         """The row of one input and total; KeyError where there is none."""
         keys = list(_HEADS[:4])
-        row: pd.Series = self.table.set_index(keys, drop=False).loc[(index, scope, axis, name)]
-        return row
+        return self.table.set_index(keys, drop=False).loc[(index, scope, axis, name)]
 
     def to_dataframe(self) -> pd.DataFrame:
         """The table."""

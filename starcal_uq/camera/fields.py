@@ -73,8 +73,7 @@ def rotation_response(b: FloatArray, B: FloatArray, w: FloatArray) -> FloatArray
     """
     normal = np.einsum("n,nij->ij", w, np.eye(3) - b[:, :, None] * b[:, None, :])
     torque = np.einsum("n,npi->ip", w, np.cross(b[:, None], np.swapaxes(B, 1, 2)))
-    response: FloatArray = np.linalg.solve(normal, torque)
-    return response
+    return np.linalg.solve(normal, torque)
 
 
 def rotated(K: FloatArray, b: FloatArray) -> FloatArray:

@@ -110,10 +110,7 @@ def _two_star_attitude(
     """Rotations (K, 3, 3) that take two catalogue directions to two measured ones, the misfit
     shared equally.
     """
-    rotation: FloatArray = _triad(b[:, first], b[:, second]) @ _triad(
-        r[:, first], r[:, second]
-    ).transpose(0, 2, 1)
-    return rotation
+    return _triad(b[:, first], b[:, second]) @ _triad(r[:, first], r[:, second]).transpose(0, 2, 1)
 
 
 def _offset(b: FloatArray, r: FloatArray, rotations: FloatArray, sizes: IntArray) -> FloatArray:

@@ -171,8 +171,7 @@ class RobustFit:
         n = 2 * int(np.sum(self.state.seen))
         inverse, scale = unit_inverse(self.information.matrix)
         middle = self.information.variability * np.outer(scale, scale) * n / (self.state.dof - p)
-        covariance: FloatArray = (inverse @ middle @ inverse) * np.outer(scale, scale)
-        return covariance
+        return (inverse @ middle @ inverse) * np.outer(scale, scale)
 
 
 def refine(

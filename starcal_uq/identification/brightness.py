@@ -68,5 +68,4 @@ def unlike_brightness(difference_mag: FloatArray, misfit: FloatArray) -> BoolArr
     z = np.abs(off) / scatter
     cost = np.minimum((_TAIL + 1.0) * np.log1p(z * z / _TAIL), _MOST)
     much_brighter = (off < -_MUCH_BRIGHTER) & (z > 2.0 * _UNLIKE)
-    refused: BoolArray = much_brighter | ((z > _UNLIKE) & (misfit + cost > _LIMIT))
-    return refused
+    return much_brighter | ((z > _UNLIKE) & (misfit + cost > _LIMIT))

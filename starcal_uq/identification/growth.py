@@ -190,8 +190,7 @@ def _in_field(fit: _Fit, sky: NearbyStars, camera: Camera, n_centroids: int) -> 
     b = np.ascontiguousarray((sky.directions[ranks] @ fit.rotation.T).T)
     (place,) = forward_kernel(_MODEL, "value")(len(ranks), fit.theta, b, np.zeros(2))
     inside = camera.contains(place.T) & before_fold(_MODEL, fit.theta, focal * b[:2] / b[2])
-    seen: IntArray = ranks[inside]
-    return seen
+    return ranks[inside]
 
 
 def _near(

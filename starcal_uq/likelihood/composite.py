@@ -230,8 +230,7 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
             gamma = np.einsum("ain,ij->ajn", gamma, np.linalg.cholesky(part.axes))
         flat = gamma.reshape(len(gamma), -1)
         v += flat @ flat.T
-    covariance: FloatArray = (h @ v @ h) * np.outer(scale, scale)
-    return covariance
+    return (h @ v @ h) * np.outer(scale, scale)
 
 
 def _pair_noise(objective: PairObjective, theta: FloatArray) -> float:

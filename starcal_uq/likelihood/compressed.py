@@ -63,8 +63,7 @@ class CompressedLikelihood:
         """Whitened parameters z (n, p) of theta (n, p)."""
         shift = np.atleast_2d(np.asarray(theta, dtype=np.float64)) - self.theta_hat
         diagonal, inverse = self._unwhitening
-        z: FloatArray = (shift / diagonal) @ inverse
-        return z
+        return (shift / diagonal) @ inverse
 
     @cached_property
     def _unwhitening(self) -> tuple[FloatArray, FloatArray]:

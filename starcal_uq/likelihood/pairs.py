@@ -134,8 +134,7 @@ class PairObjective:
         h, scale = unit_inverse(normal.matrix)
         scaled = scores * scale[:, None]
         small_sample = k / max(k - p, 1)
-        covariance: FloatArray = small_sample * (h @ scaled @ scaled.T @ h) * np.outer(scale, scale)
-        return covariance
+        return small_sample * (h @ scaled @ scaled.T @ h) * np.outer(scale, scale)
 
     def residuals(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Explicit residuals ``b_i . b_j - r_i . r_j`` (n_pairs,) and their Jacobian (n_pairs, p).

@@ -131,5 +131,4 @@ def sums_for(frames: StarFrames) -> Sums:
     if path_of(frames) == "numpy":
         return arrays
     # Numba is imported where it is needed.
-    loops: Sums = importlib.import_module("starcal_uq.likelihood.loops")
-    return loops
+    return importlib.import_module("starcal_uq.likelihood.loops")

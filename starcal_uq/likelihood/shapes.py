@@ -319,8 +319,7 @@ def frame_shapes(camera: Camera) -> Shape:
 
 def _drawn(rng: np.random.Generator, n: int, size: int) -> IntArray:
     """Places among n, each as often as the others as far as `size` allows, in random order."""
-    found: IntArray = rng.permutation(np.arange(size) % n)
-    return found
+    return rng.permutation(np.arange(size) % n)
 
 
 def _standardised(

@@ -80,8 +80,7 @@ class NormalSums:
 
 def sum_of(parts: Sequence[T]) -> T:
     """All parts together, of whatever adds up."""
-    total: T = reduce(add, parts)
-    return total
+    return reduce(add, parts)
 
 
 @dataclass(frozen=True)

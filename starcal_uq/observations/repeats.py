@@ -176,8 +176,7 @@ def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
     """Places (n, 2) of frames of `a` that `b` repeats, and of those in `b`."""
     n = len(a.sizes)
     group = np.repeat([0, 1], [n, len(b.sizes)])
-    pairs: IntArray = repeats(Fingerprints.joined([a, b]), group) - np.array([0, n], dtype=np.int64)
-    return pairs
+    return repeats(Fingerprints.joined([a, b]), group) - np.array([0, n], dtype=np.int64)
 
 
 def repeats(marks: Fingerprints, group: IntArray | None = None) -> IntArray:

@@ -173,8 +173,7 @@ def replicate_draws(
         assumed = "full" if method.recursion is None else method.recursion.pair_covariance
         if (method.method, assumed) == (number.method, pair_covariance):
             values = _replicated(replicates, index, number.quantity)
-            good: FloatArray = values[np.isfinite(values)]
-            return good
+            return values[np.isfinite(values)]
     return np.empty(0)
 
 

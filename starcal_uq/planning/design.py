@@ -341,8 +341,7 @@ class FrameChoice(Shown):
         """1 sigma with random frames over that with the chosen ones, (S, Q): above 1 where the
         choice is better.
         """
-        factors: FloatArray = self.random / self.after
-        return factors
+        return self.random / self.after
 
     def factor(self, name: str) -> tuple[float, float, float]:
         """Mean of `factors` for one quantity, and the range of 90 % of the random sets."""

@@ -80,8 +80,7 @@ class Forecast:
 
     def of(self, name: str) -> FloatArray:
         """Mean standard deviation (G,) of one quantity."""
-        column: FloatArray = self.sigma[:, self.names.index(name)]
-        return column
+        return self.sigma[:, self.names.index(name)]
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per number of frames: every quantity, and the radius with its range."""

@@ -79,8 +79,7 @@ class FrameSet:
     @cached_property
     def rest(self) -> FloatArray:
         """What the attitude of each frame adds to the common rotation, (M, 3, p)."""
-        rest: FloatArray = self.response - self.common
-        return rest
+        return self.response - self.common
 
     def seen_within(self, fraction: float) -> FloatArray:
         """Information (M, p, p) of the stars in a middle part of the detector's area, a window of

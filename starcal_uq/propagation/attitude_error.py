@@ -239,8 +239,7 @@ class AttitudeError(Shown):
     @property
     def alignment_arcsec(self) -> FloatArray:
         """Standard deviation (3,) of the alignment, which replaces the common rotation afterwards."""
-        sigma: FloatArray = np.sqrt(np.diag(self.alignment_covariance_arcsec2))
-        return sigma
+        return np.sqrt(np.diag(self.alignment_covariance_arcsec2))
 
     @property
     def stays(self) -> BoolArray:
@@ -330,8 +329,7 @@ class AttitudeError(Shown):
         wanted = np.stack(
             [_gaussian_tails(found, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)]
         )
-        made: FloatArray = (wanted + share * excess) * found
-        return made
+        return (wanted + share * excess) * found
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per contributor and axis.

@@ -171,5 +171,4 @@ def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray |
 
 
 def _frame_sums(values: Any, starts: IntArray) -> FloatArray:
-    sums: FloatArray = np.add.reduceat(values, starts[:-1], axis=0)
-    return sums
+    return np.add.reduceat(values, starts[:-1], axis=0)

@@ -453,8 +453,7 @@ def _with_sigmas(covariance: FloatArray, sigma: FloatArray) -> FloatArray:
 
 def _scaled(errors: FloatArray, sigma: FloatArray) -> FloatArray:
     own = np.sqrt(np.mean(errors.reshape(-1, 3) ** 2, axis=0))
-    scaled: FloatArray = errors * (sigma / np.where(own > 0.0, own, 1.0))
-    return scaled
+    return errors * (sigma / np.where(own > 0.0, own, 1.0))
 
 
 def _half_widths(errors: FloatArray) -> FloatArray:
@@ -469,8 +468,7 @@ def _half_widths(errors: FloatArray) -> FloatArray:
 
 
 def _diagonal(matrices: FloatArray) -> FloatArray:
-    diagonal: FloatArray = np.diagonal(matrices, axis1=-2, axis2=-1)
-    return diagonal
+    return np.diagonal(matrices, axis1=-2, axis2=-1)
 
 
 def _rms(variances: FloatArray) -> FloatArray:

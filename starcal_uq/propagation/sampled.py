@@ -131,8 +131,7 @@ class _Moments:
 
     @property
     def variance(self) -> FloatArray:
-        found: FloatArray = (self._squares - self._total**2 / self._count) / (self._count - 1)
-        return found
+        return (self._squares - self._total**2 / self._count) / (self._count - 1)
 
 
 def _with_noise(

@@ -176,8 +176,7 @@ def _neighbours(index: IntArray, size: int) -> tuple[IntArray, FloatArray]:
 def _filled(values: FloatArray, before: IntArray, weight: FloatArray) -> FloatArray:
     """A series (K, ...) of frames on the uniform instants, linear over gaps."""
     w = weight.reshape(-1, *(1,) * (values.ndim - 1))
-    series: FloatArray = values[before] * (1.0 - w) + values[before + 1] * w
-    return series
+    return values[before] * (1.0 - w) + values[before + 1] * w
 
 
 def _square_root(covariance: FloatArray) -> FloatArray:
@@ -199,8 +198,7 @@ def _deviations(series: FloatArray) -> FloatArray:
 def _power(series: FloatArray) -> FloatArray:
     """Squared amplitudes (F, ...) of a series (K, ...) at all frequencies but zero."""
     amplitude = np.fft.rfft(series, axis=0)[1:]
-    power: FloatArray = amplitude.real**2 + amplitude.imag**2
-    return power
+    return amplitude.real**2 + amplitude.imag**2
 
 
 def _autocorrelation(first: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:

@@ -211,5 +211,4 @@ def noise_by_magnitude(like: Observations, mag: FloatArray) -> FloatArray:
     level = np.array([np.median(np.log10(like.sigma_px[known][group])) for group in groups])
     exponent = np.interp(mag, middle, level)
     exponent += _PHOTON_DEX_PER_MAG * np.maximum(np.nan_to_num(mag, nan=-99.0) - middle[-1], 0.0)
-    sigma: FloatArray = np.where(np.isfinite(mag), 10.0**exponent, float(np.median(like.sigma_px)))
-    return sigma
+    return np.where(np.isfinite(mag), 10.0**exponent, float(np.median(like.sigma_px)))

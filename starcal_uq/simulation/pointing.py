@@ -39,5 +39,4 @@ def pattern_rotations(
         turn[:, 1] = _RASTER_STEP * field * (number // _RASTER_SIDE % _RASTER_SIDE - half)
     elif pattern != "stare":
         raise ValueError(f"pattern {pattern!r} is unknown: use one of {', '.join(POINTINGS)}.")
-    rotations: FloatArray = exp_rotation(turn) @ start
-    return rotations
+    return exp_rotation(turn) @ start

@@ -352,10 +352,7 @@ def _first(grid: xr.DataArray, dims: Sequence[str]) -> Mapping[Any, Any]:
 
 def cross(errors: xr.DataArray) -> xr.DataArray:
     """Root mean square over pitch and yaw of errors by axis."""
-    across: xr.DataArray = (errors.sel(axis=list(ATTITUDE[:2])) ** 2).mean(
-        "axis", skipna=False
-    ) ** 0.5
-    return across
+    return (errors.sel(axis=list(ATTITUDE[:2])) ** 2).mean("axis", skipna=False) ** 0.5
 
 
 def _levels(values: Any, drawn: bool) -> tuple[IntArray, tuple[Any, ...]]:

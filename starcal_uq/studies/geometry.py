@@ -266,8 +266,7 @@ def star_noise(mag: FloatArray, shape: NoiseShape) -> FloatArray:
     if isinstance(shape, SensorNoise):
         return shape(mag)
     size, slope, at, floor = shape
-    noise: FloatArray = np.hypot(size * 10.0 ** (slope * (mag - at)), floor)
-    return noise
+    return np.hypot(size * 10.0 ** (slope * (mag - at)), floor)
 
 
 class GeometryKey(NamedTuple):

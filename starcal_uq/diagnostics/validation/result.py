@@ -130,8 +130,7 @@ class Validation(Shown, Saved):
     @cached_property
     def z(self) -> FloatArray:
         """Errors in posterior standard deviations (n, Q)."""
-        z: FloatArray = self.error / self.sd
-        return z
+        return self.error / self.sd
 
     @property
     def coverage(self) -> FloatArray:

@@ -103,8 +103,7 @@ class AttitudeErrors:
         """Root of the sum of the squared parts, (3,); `rms` up to the chance correlation of noise
         with the others.
         """
-        total: FloatArray = np.sqrt(self.common**2 + self.rest**2 + self.noise**2)
-        return total
+        return np.sqrt(self.common**2 + self.rest**2 + self.noise**2)
 
 
 def identified_stars(

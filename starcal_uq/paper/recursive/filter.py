@@ -329,8 +329,7 @@ class Recursion:
 
     def _weights(self, n: int) -> FloatArray:
         """Weights of n frames that are taken together."""
-        weights: FloatArray = self.forgetting ** np.arange(n - 1.0, -1.0, -1.0)
-        return weights
+        return self.forgetting ** np.arange(n - 1.0, -1.0, -1.0)
 
     def _attempt(self, frame: StarFrames, point: FloatArray) -> tuple[PairNormals, _Step | None]:
         before, self.point = self.point, point

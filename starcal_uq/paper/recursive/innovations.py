@@ -217,8 +217,7 @@ class _Group:
         solved = (
             self._solved(own, right) if m <= _DENSE_STARS else self._solved_by_parts(own, right)
         )
-        gram: FloatArray = solved.transpose(0, 2, 1) @ solved
-        return gram
+        return solved.transpose(0, 2, 1) @ solved
 
     def _solved(self, own: FloatArray, right: FloatArray) -> FloatArray:
         """(G^T G + c A A^T)^-1 of columns (n, 2 m, q), from the blocks (n, m, 2, 2) of single
