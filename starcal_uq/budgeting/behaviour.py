@@ -127,7 +127,7 @@ class Behaviour:
         """Share of the power of each line that a mean of the samples of a window keeps."""
         f = self.frequency_hz
         kept = np.sinc(f * max(window_s, self.seconds)) / np.sinc(f * self.seconds)
-        return np.asarray(kept**2)
+        return kept**2
 
     def left(self, window_s: float) -> float:
         """Share of the variance that remains around the mean of the window."""

@@ -29,6 +29,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import join_words, percent, plural, significant
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.propagation.attitude_error import (
     CONTRIBUTORS,
     IF_MODEL_HOLDS,
@@ -234,7 +235,7 @@ def _of_axes(
     expected: Expected, mean: FloatArray, covariance: FloatArray, conditions: str
 ) -> list[Contributor]:
     """A row on three axes from means (3,) and covariance (3, 3), arcsec."""
-    sigma = np.sqrt(np.diag(covariance))
+    sigma = root_diagonal(covariance)
     correlations = axis_correlations(covariance, np.ones(3))
     return [
         replace(

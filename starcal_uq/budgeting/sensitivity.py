@@ -23,6 +23,7 @@ from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, check_known, require
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray, PathLike
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.tolerance import sensitivities as turns
 
@@ -136,7 +137,7 @@ def sensitivities(
     noise_unit = "px" if post.sigma_name == "sigma" else "of the stated noise"
     values = float(np.mean(post.sigma_draws)), mean_stars, obs.n_frames, temperature_k
     inputs = list(zip(SETTINGS, (noise_unit, "", "", "K"), values, strict=True))
-    known = zip(post.parameters, np.sqrt(np.diag(post.covariance)), strict=False)
+    known = zip(post.parameters, root_diagonal(post.covariance), strict=False)
     inputs += [(parameter.name, parameter.unit, sd) for parameter, sd in known]
     rows = []
     for label in dict.fromkeys(t.of_index for t in (*budget.totals, *budget.index_totals)):
@@ -223,7 +224,7 @@ class _Sizes:
         scale = np.sqrt(1.0 - share + share / gain)
         for name, weight in self.weights[place].items():
             scale = scale * inputs.get(name, 1.0) ** (held * weight)
-        return np.asarray(scale)
+        return scale
 
     def sigmas(self, rows: Sequence[Contributor], inputs: Inputs) -> FloatArray:
         """Standard deviation (4, ...) of the total on `TOTAL_AXES`, arcsec: rows of a group err as

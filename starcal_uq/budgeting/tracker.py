@@ -14,6 +14,7 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def sensor_rows(
     if sensor != new:
         added[END_OF_LIFE] = (old - moving, f"after {sensor.age_years:g} years")
     expected = {entry.name: entry for entry in FROM_FILE}
-    own = ", ".join(significant(value) for value in np.sqrt(np.diag(before)))
+    own = ", ".join(significant(value) for value in root_diagonal(before))
     rows = []
     for row, (covariance, conditions) in added.items():
         correlations = axis_correlations(covariance, np.ones(3))

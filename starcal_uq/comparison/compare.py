@@ -52,6 +52,7 @@ from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.splits import split_frames, split_labels
 
 if TYPE_CHECKING:
@@ -246,7 +247,7 @@ def _shared_parameters(a: Estimate, b: Estimate, rule: Rule) -> AnyDict:
     rows_b = [b.camera.parameter_names.index(name) for name in names]
     variances = [np.diag(a.covariance)[rows_a], np.diag(b.covariance)[rows_b]]
     rows = np.eye(a.theta.size)[rows_a], np.eye(b.theta.size)[rows_b]
-    difference = np.sqrt(np.diag(difference_matrix(rule, rows, (a, b))))
+    difference = root_diagonal(difference_matrix(rule, rows, (a, b)))
     return {
         "parameter_names": tuple(names),
         "parameter_units": tuple(specs[name][1] for name in names),
@@ -291,7 +292,7 @@ def _posterior_messages(result: Any, name: str, rule: Rule) -> list[str]:
         messages.append(clause(Differs.NOT_CONVERGED, name=name))
     if priors is None or rule.signs is None:
         return messages
-    ratio = priors.sd(result.camera_names) / np.sqrt(np.diag(result.covariance))
+    ratio = priors.sd(result.camera_names) / root_diagonal(result.covariance)
     least = int(np.argmin(ratio))
     if ratio[least] < _WIDE_PRIOR:
         narrow = {"parameter": result.camera_names[least], "times": ratio[least]}

@@ -14,6 +14,7 @@ from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import read_json, to_plain, write_json
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Shapes
+from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -156,7 +157,7 @@ class CameraComparison(Shown):
     @property
     def rotation_sigma_arcsec(self) -> FloatArray:
         """Standard deviations (3,) of the rotation."""
-        return np.sqrt(np.diag(self.rotation_covariance_arcsec2))
+        return root_diagonal(self.rotation_covariance_arcsec2)
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per quantity: ``quantity``, ``unit``, ``difference``, ``expected``, ``ratio``,

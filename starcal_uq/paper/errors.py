@@ -154,7 +154,7 @@ def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") 
 
     def growth(points: FloatArray) -> FloatArray:
         r2: FloatArray = np.sum(points**2, axis=1, keepdims=True)
-        return np.asarray(k1 * r2 + k2 * r2**2)
+        return k1 * r2 + k2 * r2**2
 
     if how == "eq6":
         return centre + offset * (1.0 + growth(offset))

@@ -34,7 +34,7 @@ from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm
-from starcal_uq.maths.linear import inverse_diagonal
+from starcal_uq.maths.linear import inverse_diagonal, root_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
@@ -540,7 +540,7 @@ def _solved(cal: Calibration, frames: StarFrames) -> Solved:
 def _three_stages(whole: Calibration, frames: StarFrames) -> Solved:
     camera = whole.nominal.with_theta(whole.pair_theta)
     classical = textbook_sigmas(PairObjective(frames, camera.distortion), whole.pair_theta)
-    return Solved(camera, whole.pair_theta, np.sqrt(np.diag(whole.pair_covariance)), classical)
+    return Solved(camera, whole.pair_theta, root_diagonal(whole.pair_covariance), classical)
 
 
 def pinhole(camera: Camera, theta: FloatArray) -> Camera:

@@ -183,9 +183,7 @@ def _replicated(replicates: Replicates, index: int, quantity: str) -> FloatArray
     for parameter, name in QUANTITIES.items():
         if name == quantity:
             column = replicates.truth.parameter_names.index(parameter)
-            return np.asarray(
-                replicates.estimates[index, :, column] * per_px(replicates.truth, parameter)
-            )
+            return replicates.estimates[index, :, column] * per_px(replicates.truth, parameter)
     return np.empty(0)
 
 

@@ -116,7 +116,7 @@ class ForecastCheck(Shown):
         ratio, _, _ = self.nees_ratio()
         n = np.sum(np.isfinite(self.nees), axis=1) * self.n_parameters
         p = chi_square_both_sides(ratio * n, n)
-        return np.asarray(p < _FAMILY_LEVEL / len(n))
+        return p < _FAMILY_LEVEL / len(n)
 
     @property
     def largest_difference(self) -> float:

@@ -27,7 +27,7 @@ from starcal_uq.core.errors import PlanningError, require
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.settings import Criterion, Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray, IntArray, floats
-from starcal_uq.maths.linear import inverses
+from starcal_uq.maths.linear import inverses, root_diagonal
 from starcal_uq.planning.forecast import quantities, spreads
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.plan import HasInformation, start_information
@@ -178,7 +178,7 @@ class _Design:
         self, information: FloatArray, criterion: str, weights: FloatArray, start: FloatArray | None
     ) -> None:
         mean = information.mean(axis=0)
-        self._scale = 1.0 / np.sqrt(np.diag(mean))
+        self._scale = 1.0 / root_diagonal(mean)
         both = np.outer(self._scale, self._scale)
         self._information = information * both
         self._flat = self._information.reshape(len(information), -1)

@@ -28,6 +28,7 @@ from starcal_uq.core.settings import OnboardModel
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.propagation.onboard_error import EffectError, OnboardError, with_cross
 from starcal_uq.propagation.thermal import ThermalError, ThermalResponse
 
@@ -239,14 +240,14 @@ class AttitudeError(Shown):
     @property
     def alignment_arcsec(self) -> FloatArray:
         """Standard deviation (3,) of the alignment, which replaces the common rotation afterwards."""
-        return np.sqrt(np.diag(self.alignment_covariance_arcsec2))
+        return root_diagonal(self.alignment_covariance_arcsec2)
 
     @property
     def stays(self) -> BoolArray:
         """True (3,) where most of the rest is one constant of the mission, as for frames that stare
         at one field.
         """
-        return np.asarray(self.rest_constant_arcsec**2 > 0.5 * self.rest_arcsec**2)
+        return self.rest_constant_arcsec**2 > 0.5 * self.rest_arcsec**2
 
     @property
     def axes(self) -> tuple[str, ...]:

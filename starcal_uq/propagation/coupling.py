@@ -12,7 +12,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray, floats
-from starcal_uq.maths.linear import correlation_of, unit_inverse
+from starcal_uq.maths.linear import correlation_of, root_diagonal, unit_inverse
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -192,13 +192,13 @@ def coupling(result: HasCovariance) -> Coupling:
     conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
     information = floats(result.information)
     inverse, scale = unit_inverse(information)
-    bound = np.sqrt(np.diag(inverse)) * scale
+    bound = root_diagonal(inverse) * scale
     priors = getattr(result, "priors", None)
     prior_sigma = None if priors is None else floats(priors.sd(names))
     response = floats(result.rotation_per_theta)
     extended, common = _extended(covariance, response)
     noise = floats(result.attitude_noise)
-    frame_sigma = np.sqrt(np.diag(response @ covariance @ response.T + noise))
+    frame_sigma = root_diagonal(response @ covariance @ response.T + noise)
     return Coupling(
         parameter_names=names,
         units=tuple(spec.unit for spec in specs),

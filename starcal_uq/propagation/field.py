@@ -37,6 +37,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -205,4 +206,4 @@ def _sigmas(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _root_diagonal(covariance: FloatArray | None) -> FloatArray | None:
-    return None if covariance is None else np.sqrt(np.diag(covariance))
+    return None if covariance is None else root_diagonal(covariance)

@@ -199,7 +199,7 @@ class Aboard:
         shift, covariance = theta - self.post.mean, self._joint[1]
         p = shift.shape[1]
         if not self.places:
-            return np.asarray(shift)
+            return shift
         follow = scaled_inverse(covariance[:p, :p]) @ covariance[:p, p:]
         values, vectors = np.linalg.eigh(covariance[p:, p:] - covariance[p:, :p] @ follow)
         root = vectors * np.sqrt(np.maximum(values, 0.0))

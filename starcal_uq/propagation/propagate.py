@@ -39,7 +39,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.settings import OnboardModel, Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, PathLike
-from starcal_uq.maths.linear import mean_weights
+from starcal_uq.maths.linear import mean_weights, root_diagonal
 from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
 from starcal_uq.propagation.attitude_error import (
     OBSERVED,
@@ -305,7 +305,7 @@ class _Split:
 
 def _total(own: Mapping[str, FloatArray]) -> FloatArray:
     """Sum over effects of covariances (..., 3, 3); zero where there is none."""
-    return np.asarray(sum(own.values(), np.zeros((3, 3))))
+    return sum(own.values(), np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,7 +445,7 @@ def _with_sigmas(covariance: FloatArray, sigma: FloatArray) -> FloatArray:
     """A first-order covariance (3, 3) with the correlations it has, and these standard
     deviations.
     """
-    own = np.sqrt(np.diag(covariance))
+    own = root_diagonal(covariance)
     scale = np.divide(sigma, own, out=np.zeros(3), where=own > 0.0)
     scaled: FloatArray = covariance * np.outer(scale, scale)
     return scaled

@@ -27,6 +27,7 @@ from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.geometry import FrameGeometry
 
@@ -183,7 +184,7 @@ def _square_root(covariance: FloatArray) -> FloatArray:
     """L (p, p) with L L^T = covariance, whose entries differ by thirty orders of magnitude and may
     be singular.
     """
-    sd = np.sqrt(np.diag(covariance))
+    sd = root_diagonal(covariance)
     scale = np.where(sd > 0.0, sd, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     root: FloatArray = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

@@ -265,7 +265,7 @@ class ThermalError(Shown):
     def outside(self) -> BoolArray:
         """True (T,) where the temperature is outside of those of the calibration."""
         warmth = self.profile.temperature_c
-        return np.asarray((warmth < self.lowest_c) | (warmth > self.highest_c))
+        return (warmth < self.lowest_c) | (warmth > self.highest_c)
 
     @property
     def outside_share(self) -> float:

@@ -23,7 +23,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.inference.priors import Priors
-from starcal_uq.maths.linear import correlation_of, inverses
+from starcal_uq.maths.linear import correlation_of, inverses, root_diagonal
 from starcal_uq.planning.effects import JointMatrices, PlannedEffects, joint_inverses
 from starcal_uq.propagation.coupling import weak_directions
 from starcal_uq.studies.axes import CAMERA_AXES, camera_of, planned_effects
@@ -203,7 +203,7 @@ def without_effects(frame: FloatArray, joint: JointMatrices, n: int) -> FloatArr
     """Mean information (p, p) on the parameters of n frames, effects eliminated."""
     p = int(np.count_nonzero(joint.prior == 0.0))
     inner = frame[p:, p:] + np.diag(joint.prior[p:]) / n
-    return np.asarray(frame[:p, :p] - frame[:p, p:] @ np.linalg.solve(inner, frame[p:, :p]))
+    return frame[:p, :p] - frame[:p, p:] @ np.linalg.solve(inner, frame[p:, :p])
 
 
 def covariances(
@@ -255,13 +255,13 @@ def coupling_numbers(
     if joint is not None:
         total = np.linalg.inv(every[0][:p, :p])
         if "temperature" in joint.places:
-            sigma = np.sqrt(np.diag(every[0]))[joint.places["temperature"]] * joint.per_kelvin
+            sigma = root_diagonal(every[0])[joint.places["temperature"]] * joint.per_kelvin
             slopes = dict(zip(("slope_x0", "slope_y0", "slope_f"), sigma.tolist(), strict=True))
     return (
         slopes
         | covariance_numbers(every[0], stated.camera.distortion, common, forms)
         | {
-            "sigma_data": np.sqrt(np.diag(data))[:p],
+            "sigma_data": root_diagonal(data)[:p],
             "condition_number": condition(total),
             "error_curve_arcsec": curve,
             "sigma_curve": sigma_curve.T,
@@ -280,7 +280,7 @@ def covariance_numbers(
     conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
     weakest = weak_directions(correlation, names)[0]
     rotation = common @ covariance @ common.T
-    turn = np.sqrt(np.diag(rotation))
+    turn = root_diagonal(rotation)
     return {
         "sigma": sigma,
         "sigma_conditional": conditional,
@@ -297,7 +297,7 @@ def covariance_numbers(
 
 def condition(information: FloatArray) -> float:
     """Condition number of an information matrix scaled to a unit diagonal."""
-    scale = 1.0 / np.sqrt(np.diag(information))
+    scale = 1.0 / root_diagonal(information)
     return float(np.linalg.cond(information * np.outer(scale, scale)))
 
 

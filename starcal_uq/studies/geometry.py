@@ -24,6 +24,7 @@ from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, In
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.terms import add_by_group
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.effects import JointMatrices, PlannedEffects
 from starcal_uq.planning.information import frame_matrices
@@ -492,7 +493,7 @@ def _star_spread(
     excess = own - np.einsum("pxn,qxn,n->pq", h, h, 1.0 - share, optimize=True)
     common = (every - own) / (m * (m - 1)) if m > 1 else np.zeros_like(own)
     # A difference of sums over stars that hardly repeat may be negative by chance.
-    size = np.sqrt(np.diag(own))
+    size = root_diagonal(own)
     values, vectors = np.linalg.eigh(common / np.outer(size, size))
     common = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size)
     return excess / m, common

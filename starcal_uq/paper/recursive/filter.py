@@ -36,6 +36,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import PairCovariance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, floats
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.innovations import PairNormals, frame_normals
 
@@ -233,7 +234,7 @@ class Recursion:
         """Take frames in, one after the other."""
         if not self.history.costs:
             self.history.add(
-                0, self.offset, self.reference_px * np.sqrt(np.diag(self.covariance)), 0.0
+                0, self.offset, self.reference_px * root_diagonal(self.covariance), 0.0
             )
         first, window = 0, 1
         while first < frames.n_frames:

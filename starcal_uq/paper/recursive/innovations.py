@@ -181,15 +181,13 @@ class _Group:
     @cached_property
     def innovations(self) -> FloatArray:
         """Differences of cosines (n, m, m)."""
-        return np.asarray(self.r @ self.r.transpose(0, 2, 1) - self.b @ self.transposed)
+        return self.r @ self.r.transpose(0, 2, 1) - self.b @ self.transposed
 
     @cached_property
     def by_pair(self) -> FloatArray:
         """Of star i, axis a: change of its cosine with star j, (n, m, 2, m)."""
         n, m = self.b.shape[:2]
-        return np.asarray(
-            (self.by_pixel.reshape(n, 2 * m, 3) @ self.transposed).reshape(n, m, 2, m)
-        )
+        return (self.by_pixel.reshape(n, 2 * m, 3) @ self.transposed).reshape(n, m, 2, m)
 
     def full(self) -> FloatArray:
         """Gram matrices (n, 1 + p, 1 + p) of d and J."""
@@ -254,13 +252,13 @@ class _Group:
         blocks = np.linalg.inv(own + (_RIDGE / m) * trace[:, None, None, None] * np.eye(2))
 
         def apart(columns: FloatArray) -> FloatArray:
-            return np.asarray((blocks @ columns.reshape(n, m, 2, -1)).reshape(columns.shape))
+            return (blocks @ columns.reshape(n, m, 2, -1)).reshape(columns.shape)
 
         alone, spread = apart(right), apart(common)
         joint = np.linalg.solve(
             core + common.transpose(0, 2, 1) @ spread, common.transpose(0, 2, 1) @ alone
         )
-        return np.asarray(alone - spread @ joint)
+        return alone - spread @ joint
 
     def diagonal(self) -> FloatArray:
         """Gram matrices (n, 1 + p, 1 + p) of z and H over pairs taken as independent."""

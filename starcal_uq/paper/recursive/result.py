@@ -18,7 +18,7 @@ from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.solvers import is_singular
-from starcal_uq.maths.linear import correlation_of
+from starcal_uq.maths.linear import correlation_of, root_diagonal
 from starcal_uq.paper.recursive.filter import FrameSums, Recursion, entry_count, frame_entries
 from starcal_uq.paper.recursive.innovations import frame_normals
 
@@ -168,9 +168,7 @@ def filter_stage(recursion: Recursion, seconds: float) -> Stage:
     if n and not np.array_equal(trajectory[-1], recursion.theta):
         # A thinned history may have left out the last frame.
         trajectory[-1] = recursion.theta
-        sigmas[-1, :q] = (
-            recursion.sigma * np.sqrt(np.diag(recursion.covariance)) * recursion.scale[:q]
-        )
+        sigmas[-1, :q] = recursion.sigma * root_diagonal(recursion.covariance) * recursion.scale[:q]
     cost = np.array(history.costs)
     return Stage(
         "filter", trajectory, cost, filter_status(recursion), recursion.n_frames, seconds, sigmas
@@ -181,8 +179,8 @@ def filter_status(recursion: Recursion) -> Status:
     """Whether the frames determined every parameter, and the last estimate agrees with its
     linearisation.
     """
-    prior = np.sqrt(np.diag(recursion.start_covariance))
-    if np.any(np.sqrt(np.diag(recursion.covariance)) > _UNMEASURED * prior):
+    prior = root_diagonal(recursion.start_covariance)
+    if np.any(root_diagonal(recursion.covariance) > _UNMEASURED * prior):
         return Status.SINGULAR
     return Status.CONVERGED if recursion.settled else Status.MAX_ITERATIONS
 

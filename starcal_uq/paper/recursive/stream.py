@@ -22,6 +22,7 @@ from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, noise_px, raise_unless_good
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.filter import FrameSums, Recursion
 from starcal_uq.paper.recursive.result import (
@@ -80,7 +81,7 @@ class FilterStep:
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviation of each parameter, (q,)."""
-        return np.sqrt(np.diag(self.covariance))
+        return root_diagonal(self.covariance)
 
 
 class RecursiveCalibration:
