@@ -13,23 +13,29 @@ All work is counted: so many patterns of so many frames, so many of them matched
 
 from __future__ import annotations
 
-import hashlib
 from bisect import bisect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import chain, combinations, pairwise
+from functools import cached_property, lru_cache, partial
+from itertools import combinations, pairwise, product
 from math import log10, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, PathLike
 from starcal_uq.identification.growth import Patch, grow, matched_patch
 from starcal_uq.identification.match import match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
-from starcal_uq.identification.pairs import angle_between, remembered
+from starcal_uq.identification.pairs import (
+    angle_between,
+    cached,
+    digest_of,
+    remembered,
+    rows_of,
+)
 from starcal_uq.identification.pyramid import (
     SIGMAS,
     CameraTolerance,
@@ -144,48 +150,118 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     return codes, quads, angle_between(directions[quads[:, 0]], directions[quads[:, 1]])
 
 
+# Codes are kept by cells of this width, so that what is like a code lies in one or two of them along
+# each axis. The number of a cell has a byte for each axis.
+_CELL = 4.0 * _CODE_TOLERANCE
+_BYTES = 1 << np.array([24, 16, 8, 0])
+_ONE_OR_TWO = np.array(list(product((0, 1), repeat=4)))
+# Neighbouring cells are spread over the table of a level by this factor.
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+
+
+def _cells_near(codes: FloatArray) -> tuple[IntArray, IntArray]:
+    """Cells that hold what is like each of some codes (q, 4): the rows of codes, and cells."""
+    low = np.floor((codes - _CODE_TOLERANCE) / _CELL).astype(np.int64)
+    more = np.floor((codes + _CODE_TOLERANCE) / _CELL).astype(np.int64) - low
+    used = np.all(more[:, None] >= _ONE_OR_TWO, axis=2)
+    cells = (low @ _BYTES)[:, None] + _ONE_OR_TWO @ _BYTES
+    return np.nonzero(used)[0], cells[used]
+
+
+def _places(cells: IntArray, n: int) -> IntArray:
+    """Places of cells in a table of n, a power of two."""
+    mixed = cells.astype(np.uint64) * _SPREAD
+    return (mixed >> np.uint64(65 - n.bit_length())).astype(np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The brightest stars of the sky, (n, 3), and their patterns."""
+    """The brightest stars of the sky, (n, 3), and their q patterns, sorted by the places of their
+    codes in a table of t.
+
+    Points (q, 4), longest sides (q,) and codes (q, 4) of the patterns; `start` (t + 1,) is the
+    first of each place.
+    """
 
     directions: FloatArray
-    stars: cKDTree
-    quads: IntArray
+    quads: NDArray[np.int32]
     size_rad: FloatArray
-    codes: cKDTree
+    codes: NDArray[np.float32]
+    start: NDArray[np.int32]
+
+    @property
+    def fits(self) -> bool:
+        q, places = len(self.quads), len(self.start) - 1
+        whole = len(self.size_rad) == len(self.codes) == q == int(self.start[-1])
+        return whole and places & (places - 1) == 0 and int(self.quads.max()) < len(self.directions)
+
+    @cached_property
+    def stars(self) -> cKDTree:
+        """The stars as a tree of `directions`."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.directions)
+
+    def alike(self, codes: FloatArray, row: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
+        """Rows of codes (q, 4), and patterns of the level, that are alike, looking at these cells
+        for these rows.
+        """
+        place = _places(cell, len(self.start) - 1)
+        start = self.start[place].astype(np.int64)
+        count = self.start[place + 1] - start
+        mine, theirs = np.repeat(row, count), rows_of(start, count)
+        apart = self.codes[theirs] - codes[mine]
+        near = np.einsum("ij,ij->i", apart, apart) < _CODE_TOLERANCE**2
+        # Cells of one row that share a place show the same patterns.
+        n = max(len(self.codes), 1)
+        return np.divmod(np.unique(mine[near] * n + theirs[near]), n)
+
+
+def _nearest(n: int) -> int:
+    """Nearest stars that a star makes patterns with, on a level of n."""
+    return next((k for most, k in _NEAREST if n <= most), _NEAREST[-1][1])
 
 
 def make_level(directions: FloatArray) -> Level:
     """The level of these stars."""
     from scipy.spatial import cKDTree
 
-    stars = cKDTree(directions)
-    nearest = next((k for most, k in _NEAREST if len(directions) <= most), _NEAREST[-1][1])
-    quads = quads_of(stars.query(directions, nearest + 1)[1])
+    quads = quads_of(cKDTree(directions).query(directions, _nearest(len(directions)) + 1)[1])
     # In blocks that stay in the processor's cache.
     blocks = [codes_of(directions, quads[k : k + _AT_ONCE]) for k in range(0, len(quads), _AT_ONCE)]
     codes, quads, size = (np.concatenate(column) for column in zip(*blocks, strict=True))
-    return Level(
-        directions, stars, quads, size, cKDTree(codes, balanced_tree=False, compact_nodes=False)
-    )
+    codes = codes.astype(np.float32)
+    n = 1 << len(codes).bit_length()
+    place = _places(np.floor(codes / _CELL).astype(np.int64) @ _BYTES, n)
+    order = np.argsort(place, kind="stable")
+    start = np.searchsorted(place[order], np.arange(n + 1)).astype(np.int32)
+    return Level(directions, quads[order].astype(np.int32), size[order], codes[order], start)
 
 
 # Levels of before: catalogues of any depth share those of the bright stars.
 _KEPT_LEVELS = 13
-_made: dict[bytes, Level] = {}
+_made: dict[str, Level] = {}
+# To be raised when what a level holds changes, or how it is made.
+_VERSION = 1
 
 
 class Levels:
-    """The levels of a catalogue, made when they are first asked for."""
+    """The levels of a catalogue, made when they are first asked for, and kept in a `folder` where
+    there is one.
+    """
 
-    def __init__(self, stars: StarCatalogue) -> None:
+    def __init__(self, stars: StarCatalogue, folder: PathLike | None) -> None:
         order = np.argsort(stars.mag, kind="stable")
         self._directions = np.ascontiguousarray(stars.directions_icrs[order[: LEVELS[-1]]])
+        self._folder = folder
 
     def __getitem__(self, n: int) -> Level:
         bright = self._directions[:n]
-        key = hashlib.sha256(bright.tobytes()).digest()
-        return remembered(_made, _KEPT_LEVELS, key, lambda: make_level(bright))
+        key = digest_of((bright,), _VERSION, _CELL, _nearest(len(bright)))
+        make = partial(make_level, bright)
+        if self._folder is not None:
+            make = partial(cached, Level, f"star-patterns-{key}", make, self._folder)
+        return remembered(_made, _KEPT_LEVELS, key, make)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,11 +291,16 @@ class Solved:
 
 
 class BlindSearch:
-    """One catalogue and one size of detector, of a camera whose focal length may be anything."""
+    """One catalogue and one size of detector, of a camera whose focal length may be anything.
 
-    def __init__(self, stars: StarCatalogue, width_px: int, height_px: int) -> None:
+    The catalogue's patterns are kept in a `folder` where there is one.
+    """
+
+    def __init__(
+        self, stars: StarCatalogue, width_px: int, height_px: int, folder: PathLike | None = None
+    ) -> None:
         self.stars = stars
-        self.levels = Levels(stars)
+        self.levels = Levels(stars, folder)
         self.width, self.height = float(width_px), float(height_px)
         corner = 0.5 * float(np.hypot(width_px, height_px))
         self.geometry = FieldGeometry(self.width, self.width, self.height, corner)
@@ -279,20 +360,17 @@ class BlindSearch:
         """
         rays = unit_directions(u, np.array([focal]))[0]
         codes, quads, size = codes_of(rays, quads)
+        row, cell = _cells_near(codes)
         faintest = quads.max(axis=1) + 1
         least, most = _LEAST_IN_FIELD * faintest, _MOST_IN_FIELD * np.maximum(faintest, 12)
         for n in sizes:
             # Stars of the level in the field, for a focal length of one pixel.
             stars = n * self.width * self.height / (4.0 * pi)
-            use = np.flatnonzero((most > stars / high**2) & (least < stars / low**2))
-            if not len(use):
+            use = (most > stars / high**2) & (least < stars / low**2)
+            if not use.any():
                 continue
-            level = self.levels[n]
-            hits = level.codes.query_ball_point(codes[use], _CODE_TOLERANCE)
-            # Most lists are empty, which an array of them tells sooner than a loop.
-            some = np.flatnonzero(hits.astype(np.bool_))
-            mine = np.repeat(use[some], [len(hit) for hit in hits[some]])
-            theirs = np.fromiter(chain.from_iterable(hits[some]), dtype=np.int64)
+            level, used = self.levels[n], use[row]
+            mine, theirs = level.alike(codes, row[used], cell[used])
             f = focal * size[mine] / level.size_rad[theirs]
             expected = stars / f**2
             ok = (f >= low) & (f <= high) & (expected > least[mine]) & (expected < most[mine])
@@ -436,6 +514,7 @@ def find_optics(
     width_px: int,
     height_px: int,
     ranges: Sequence[tuple[float, float]],
+    folder: PathLike | None = None,
 ) -> tuple[FoundOptics, int, Patch] | None:
     """The focal length that frames agree on, and the surest frame with its stars; None where there
     is none.
@@ -443,7 +522,8 @@ def find_optics(
     A frame is points (n, 2) from the detector's middle, brightest first, and their noise (n,), px.
     `stars` gives a catalogue of at least so many stars of the whole sky, or of all that there are.
     `ranges` are focal lengths, px, to look for first in the first, then in the next; no level of
-    the catalogue is searched twice for one range.
+    the catalogue is searched twice for one range. The catalogue's patterns are kept in a `folder`
+    where there is one.
 
     A frame alone counts where chance makes what it shows less than once in 10^9; otherwise two must
     agree.
@@ -461,7 +541,7 @@ def find_optics(
                 continue
             catalogue = stars(sizes[-1])
             if search is None or catalogue is not search.stars:
-                search = BlindSearch(catalogue, width_px, height_px)
+                search = BlindSearch(catalogue, width_px, height_px, folder)
             sizes = [n for n in sizes if n <= len(catalogue)]
             found = _agreed(search, frames, probes, sizes, limits)
             if found is not None:

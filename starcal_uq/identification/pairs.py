@@ -12,11 +12,11 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,19 @@ class StarPairs:
     def __len__(self) -> int:
         return len(self.star)
 
+    @property
+    def fits(self) -> bool:
+        n, p = len(self.star), len(self.angle)
+        sizes = {
+            "directions": n,
+            "first": p,
+            "second": p,
+            "neighbour": 2 * p,
+            "neighbour_angle": 2 * p,
+            "neighbour_start": n + 1,
+        }
+        return all(len(getattr(self, name)) == size for name, size in sizes.items())
+
     def near_angle(
         self, star: IntArray, angle_rad: FloatArray, tolerance_rad: float
     ) -> tuple[IntArray, IntArray]:
@@ -83,11 +96,8 @@ class StarPairs:
         count = edges[place + last + 1] - start
         # A range beyond the largest angle is the last step, which the comparison below empties.
         some = np.flatnonzero(count > 0)
-        start, count = start[some], count[some]
-        total = np.cumsum(count)
-        n = int(total[-1]) if len(total) else 0
-        question = np.repeat(some, count)
-        row = np.arange(n) + np.repeat(start - (total - count), count)
+        question = np.repeat(some, count[some])
+        row = rows_of(start[some], count[some])
         inside = np.flatnonzero(
             np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad
         )
@@ -119,6 +129,13 @@ class StarPairs:
         edges = np.zeros(len(self) * steps + 1, dtype=np.int32)
         np.cumsum(np.bincount(star, minlength=len(edges) - 1), out=edges[1:])
         return edges, steps, 1.0 / width
+
+
+def rows_of(start: Any, count: Any) -> Any:
+    """Rows of ranges, one range after the other."""
+    total = np.cumsum(count)
+    n = int(total[-1]) if len(total) else 0
+    return np.arange(n) + np.repeat(start - (total - count), count)
 
 
 def find_star_pairs(
@@ -204,7 +221,7 @@ def prepared_star_pairs(
     """
     given = directions, mag, field_sr, max_angle_rad
     make = partial(cached_star_pairs, cache_dir=cache_dir) if cache else find_star_pairs
-    return remembered(_recent, _RECENT, _digest(*given), partial(make, *given))
+    return remembered(_recent, _RECENT, _pairs_digest(*given), partial(make, *given))
 
 
 def remembered(kept: dict[K, V], most: int, key: K, make: Callable[[], V]) -> V:
@@ -218,10 +235,16 @@ def remembered(kept: dict[K, V], most: int, key: K, make: Callable[[], V]) -> V:
     return found
 
 
-def _digest(directions: FloatArray, mag: FloatArray, *parameters: float) -> str:
-    """What pairs are made of, in 24 letters."""
-    digest = hashlib.sha256(repr((_VERSION, *parameters, PATTERN_STARS)).encode())
-    for array in (directions, mag):
+def _pairs_digest(
+    directions: FloatArray, mag: FloatArray, field_sr: float, max_angle_rad: float
+) -> str:
+    return digest_of((directions, mag), _VERSION, field_sr, max_angle_rad, PATTERN_STARS)
+
+
+def digest_of(arrays: Iterable[FloatArray], *parameters: Any) -> str:
+    """What something is made of, in 24 letters."""
+    digest = hashlib.sha256(repr(parameters).encode())
+    for array in arrays:
         digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
     return digest.hexdigest()[:24]
 
@@ -233,28 +256,44 @@ def cached_star_pairs(
     max_angle_rad: float,
     cache_dir: PathLike | None = None,
 ) -> StarPairs:
-    """`find_star_pairs`, from a file of the cache folder where there is one, leaving one there
+    """`find_star_pairs`, `cached` in the folder."""
+    given = directions, mag, field_sr, max_angle_rad
+    name = f"star-pairs-{_pairs_digest(*given)}"
+    return cached(StarPairs, name, partial(find_star_pairs, *given), cache_dir)
+
+
+class Fitting(Protocol):
+    """A dataclass of arrays."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the arrays fit together."""
+
+
+F = TypeVar("F", bound=Fitting)
+
+
+def cached(kind: type[F], name: str, make: Callable[[], F], cache_dir: PathLike | None) -> F:
+    """A dataclass of arrays from a file of the cache folder where there is one, leaving one there
     where there is none.
 
-    The file's name is a hash of the catalogue and of all parameters. A damaged file is replaced; a
-    folder that cannot be written to does no harm.
+    The `name` holds a hash of all that it is made of. A damaged file is replaced; a folder that
+    cannot be written to does no harm.
     """
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir)
-    path = folder / f"star-pairs-{_digest(directions, mag, field_sr, max_angle_rad)}.npz"
-    stored = _read(path)
+    path = folder / f"{name}.npz"
+    stored = _read(path, kind)
     if stored is not None:
         return stored
-    pairs = find_star_pairs(directions, mag, field_sr, max_angle_rad)
+    made = make()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
-            np.savez(
-                temporary, **{field.name: getattr(pairs, field.name) for field in fields(StarPairs)}
-            )
+            np.savez(temporary, **{name: getattr(made, name) for name in _names(kind)})
     except (OSError, RunFolderError):
         # The cache only saves time: without it everything works.
-        return pairs
-    return pairs
+        return made
+    return made
 
 
 def default_cache_dir() -> Path:
@@ -272,25 +311,18 @@ def default_cache_dir() -> Path:
     return Path.home() / ".cache" / "starcal_uq"
 
 
-def _read(path: Path) -> StarPairs | None:
-    """The pairs in a file; None where it is missing, damaged or does not fit together."""
-    names = [field.name for field in fields(StarPairs)]
+def _names(kind: Any) -> list[str]:
+    return [field.name for field in fields(kind)]
+
+
+def _read(path: Path, kind: type[F]) -> F | None:
+    """What is in a file; None where it is missing, damaged or does not fit together."""
     try:
         archive = read_arrays(path)
-        pairs = StarPairs(**{name: archive[name] for name in names})
-        n, p = len(pairs.star), len(pairs.angle)
-        sizes = {
-            "directions": n,
-            "first": p,
-            "second": p,
-            "neighbour": 2 * p,
-            "neighbour_angle": 2 * p,
-            "neighbour_start": n + 1,
-        }
-        fits = all(len(getattr(pairs, name)) == size for name, size in sizes.items())
-    except Exception:  # whatever is wrong with a file of the cache, the pairs are made again
+        found = kind(**{name: archive[name] for name in _names(kind)})
+        return found if found.fits else None
+    except Exception:  # whatever is wrong with a file of the cache, its content is made again
         return None
-    return pairs if fits else None
 
 
 def _chord(angle_rad: float) -> float:

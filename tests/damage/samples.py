@@ -82,9 +82,9 @@ def _checkpoint(path: Path) -> Any:
 
 
 def _pairs(path: Path) -> Any:
-    from starcal_uq.identification.pairs import _read
+    from starcal_uq.identification.pairs import StarPairs, _read
 
-    pairs = _read(path)
+    pairs = _read(path, StarPairs)
     if pairs is None:
         raise StarcalError(f"{path}: the pairs are made again.")
     return pairs

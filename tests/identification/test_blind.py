@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -14,10 +15,11 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import IdentificationError
-from starcal_uq.identification.blind import codes_of, quads_of
+from starcal_uq.identification import blind
+from starcal_uq.identification.blind import Levels, codes_of, make_level, quads_of
 from starcal_uq.identification.engine import _Attempt, identify
 from starcal_uq.identification.match import Match
-from starcal_uq.identification.pairs import angle_between
+from starcal_uq.identification.pairs import angle_between, cached
 from starcal_uq.identification.search import NOT_SEARCHED, Search
 from starcal_uq.identification.sheet import sheet_of
 from starcal_uq.images.centroids import Centroids
@@ -387,3 +389,65 @@ def test_failure_is_bounded_in_count(stars: StarCatalogue, monkeypatch: pytest.M
     # What shows no lens, however it bends, is not looked at once more with a worse one.
     assert [triangles for _, triangles in looks] == [200] * 3 + [40] * 37
     assert {k for k, _ in looks} == set(range(n))
+
+
+def test_like_patterns_are_those_of_a_comparison_with_all() -> None:
+    level = make_level(sc.load_catalogue(4.5).directions_icrs[:150])
+    rng = np.random.default_rng(8)
+    codes = level.codes[::7] + rng.normal(0.0, 0.004, (len(level.codes[::7]), 4))
+    mine, theirs = level.alike(codes, *blind._cells_near(codes))
+    apart = np.linalg.norm(codes[:, None] - level.codes[None], axis=2)
+    assert np.array_equal(
+        np.argwhere(apart < blind._CODE_TOLERANCE), np.column_stack([mine, theirs])
+    )
+    # Codes without a like one are among them, and codes with several.
+    found = np.bincount(mine, minlength=len(codes))
+    assert found.min() == 0
+    assert found.max() > 1
+
+
+def test_patterns_are_kept_on_disk_and_damaged_files_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stars, folder = sc.load_catalogue(5.0), tmp_path / "new" / "cache"
+    made: list[int] = []
+
+    def counted(directions: Any) -> blind.Level:
+        made.append(len(directions))
+        return make_level(directions)
+
+    monkeypatch.setattr(blind, "make_level", counted)
+
+    def level(stars: sc.StarCatalogue, folder: Path | None) -> blind.Level:
+        blind._made.clear()
+        return Levels(stars, folder)[256]
+
+    first = level(stars, folder)
+    (path,) = folder.iterdir()
+    stored = path.read_bytes()
+    again = level(stars, folder)
+    assert made == [256]
+    assert np.array_equal(first.codes, again.codes) and np.array_equal(first.quads, again.quads)
+    # Whole archives, too, whose arrays do not fit together.
+    np.savez(tmp_path / "other.npz", **{**vars(first), "size_rad": first.size_rad[1:]})
+    other = (tmp_path / "other.npz").read_bytes()
+    for number, damage in enumerate((b"", b"no archive", stored[: len(stored) // 2], other)):
+        path.write_bytes(damage)
+        assert np.array_equal(level(stars, folder).start, first.start)
+        assert len(made) == number + 2
+        assert path.read_bytes() == stored
+    # A file is in the way of the folder: no cache, no error.
+    assert np.array_equal(level(stars, path / "below").codes, first.codes)
+    # Stars at other places have another file.
+    level(replace(stars, ra_deg=stars.ra_deg + 1e-9), folder)
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_several_writers_leave_one_whole_file(tmp_path: Path) -> None:
+    level = make_level(sc.load_catalogue(5.0).directions_icrs[:256])
+    with ThreadPoolExecutor(6) as pool:
+        ends = [
+            pool.submit(cached, blind.Level, "patterns", lambda: level, tmp_path) for _ in range(24)
+        ]
+        assert all(np.array_equal(end.result().codes, level.codes) for end in ends)
+    assert [path.name for path in tmp_path.iterdir()] == ["patterns.npz"]
