@@ -380,7 +380,8 @@ def _as_it_is(plain: _Fit, quiet: bool, status: Status, screened: bool) -> str |
     wrong = 1.0 - plain.share
     if wrong > 0.8:
         return clause(Slip.NO_ATTITUDE)
-    if wrong > _FEW_WRONG:
+    # Where the others agree closely, a few spoil the fit.
+    if wrong > (0.0 if quiet and status is Status.INCONSISTENT else _FEW_WRONG):
         screen = Remedy("calibrate", (OBS, CAMERA), {"out": RUN, "screening": True})
         again = screened or wrong > 0.6
         return clause(Slip.WRONG_STARS, share=wrong, screen=None if again else screen)

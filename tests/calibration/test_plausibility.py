@@ -171,6 +171,18 @@ def test_from_a_wrong_focal_length_the_right_one_is_found_or_the_slip_named(slip
         assert found.theta[:3] == pytest.approx(seen(field).theta[:3], rel=2e-3)
 
 
+@pytest.mark.parametrize("share", [0.005, 0.012])
+def test_few_wrong_stars_are_named_where_the_others_agree(share):
+    c = seen(15.0)
+    stars = sc.Observations(**(c.columns | wrong_share(c, share)))
+    with pytest.raises(
+        CalibrationError, match=r"about (0\.[2-9]|1|2) % of the stars .*calibration\.screen"
+    ):
+        sc.calibrate(stars, sheet(c))
+    screened = sc.calibration.screen(stars, sheet(c)).calibration
+    assert screened.theta[:3] == pytest.approx(c.theta[:3], abs=1.0)
+
+
 @pytest.mark.parametrize("field", FIELDS)
 def test_wrong_stars_and_noise_are_told_apart(field):
     c = seen(field)
