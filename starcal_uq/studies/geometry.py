@@ -19,7 +19,6 @@ from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.formatting import count
 from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
@@ -400,7 +399,7 @@ def _random(key: GeometryKey, window: _Views, n: int) -> Geometry:
         tries += _BLOCK * wanted
         if tries >= _LEAST_TRIES and good < _LEAST_SKY * tries:
             raise StudyError(
-                f"only {good} of {count(tries)} random attitudes show {key.min_stars} stars to "
+                f"only {good} of {tries} random attitudes show {key.min_stars} stars to "
                 "magnitude "
                 f"{key.max_mag:g}: raise max_mag, widen the field, or lower min_stars."
             )

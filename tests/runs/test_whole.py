@@ -13,7 +13,6 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.cli.app import main
 from starcal_uq.cli.schemas import document
-from starcal_uq.runs import whole
 from tests.cli.conftest import check_document
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
@@ -93,17 +92,7 @@ def test_a_run_is_shown_by_its_verdict_and_kept_as_long_as_it_is_asked_for(few, 
     assert not place.parent.exists()
 
 
-def test_start_frames_and_velocity_are_options_of_the_command_that_repeats_a_run(tmp_path):
-    settings = {
-        "start": {"focal_px": 2500.123456789},
-        "frames": [(0, 4), (7, 7)],
-        "observer_velocity_km_s": (7.5, 0, -1),
-    }
-    words = whole._words([tmp_path / "obs.csv"], tmp_path / "camera.toml", settings)
-    expected = (
-        "--start focal_px=2500.123456789 --only-frames 0-4,7-7 --observer-velocity 7.5,0.0,-1.0"
-    )
-    assert " ".join(words[3:]) == expected
+START = {"start": {"focal_mm": 71.123456789}, "frames": [(0, 5), (7, 11)]}
 
 
 @pytest.mark.slow
@@ -111,7 +100,7 @@ def test_a_run_in_a_folder_has_a_report_and_the_command_that_repeats_it(few, tmp
     files = (tmp_path / "obs.ecsv", tmp_path / "camera.toml")
     files[0].write_text(files[0].read_text("utf-8").replace("x_px", "column"), "utf-8")
     columns = {"x_px": "column"}
-    run = sc.run(*files, out="run", effects=["tails"], columns=columns, seed=2, **FEW)
+    run = sc.run(*files, out="run", effects=["tails"], columns=columns, seed=2, **START, **FEW)
     assert (
         run.has("report")
         and run.has("run_file")
