@@ -194,7 +194,8 @@ def check_columns(
 
 def _unit_remedy(outside: BoolArray) -> str:
     """Not single rows are to blame where most are outside."""
-    return "check the unit of the whole column, or its factor" if outside.mean() > 0.5 else _REPAIR
+    most = 2 * np.count_nonzero(outside) > len(outside)
+    return "check the unit of the whole column, or its factor" if most else _REPAIR
 
 
 def _in_millimetres(columns: AnyMapping, camera: Camera) -> list[Problem]:
