@@ -74,7 +74,7 @@ def test_columns_in_other_units_are_those_of_a_whole_table(tmp_path, ending):
     found = [stream_frames(path, camera(), columns, batch_rows=7)]
     if ending == ".parquet":
         found.append(sc.observations.open_partitions(tmp_path, camera(), columns))
-        with pytest.raises(ObservationError, match="column RA is missing; say which it is"):
+        with pytest.raises(ObservationError, match="column RA is missing; the file has "):
             sc.observations.open_partitions(tmp_path, camera(), columns | {"ra_deg": "RA * 15"})
     for frames in found:
         frames = list(frames)
