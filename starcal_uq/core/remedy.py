@@ -108,11 +108,11 @@ class Remedy:
     @property
     def words(self) -> str:
         """What to type or to call, in a sentence of its own: as the command line has it while it
-        runs, and a call where what it needs may be in memory alone.
+        runs, and a call of a calibration with other options, whose stars may be in memory alone.
         """
         if _speakers:
             return _speakers[-1](self)
-        return (OBS in self.files and self.call) or self.command or self.call
+        return (OBS in self.files and self.options and self.call) or self.command or self.call
 
     def __str__(self) -> str:
         return f"run `{self.words}` {self.purpose}".rstrip()

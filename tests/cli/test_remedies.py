@@ -363,7 +363,6 @@ ELSEWHERE = {
     "study": "tests/cli/test_study.py",
     "new study": "tests/cli/test_study.py",
     "validate CAMERA": "tests/cli/test_statistics.py",
-    "--help": "tests/cli/test_commands.py",
 }
 
 # Arguments that sentences advise, and a call with each.

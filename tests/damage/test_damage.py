@@ -403,7 +403,7 @@ ONCE = [
     ),
     ("catalogue.ecsv", _header_only, "holds no stars"),
     ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not valid YAML"),
-    ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"of those in the file \(\\x07, x\)"),
+    ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"the file has \\x07, x: give"),
     ("catalogue.csv.gz", lambda d: d[:100], "is not readable as CSV"),
     (
         "catalogue.fits",
