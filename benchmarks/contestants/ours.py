@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +113,7 @@ def command(
         raise Missing(f"{needs} is not on this machine")
     # -P: else the package in the folder where the benchmark was started goes before the one that is
     # asked for.
-    program = [sys.executable, "-P", "-c", "from starcal_uq.cli.app import main; main()"]
+    program = [sys.executable, "-P", "-m", "starcal_uq"]
 
     def run() -> Result:
         peak = 0.0
@@ -121,7 +122,8 @@ def command(
             process = subprocess.Popen([*program, *words], stdout=said, stderr=said)
             while process.poll() is None:
                 peak = max(peak, _tree_mb(process.pid))
-                time.sleep(0.1)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(0.1)
             said.seek(0)
             text = said.read()
             # Status 1 is a verdict on the data, such as those of real frames.
