@@ -161,6 +161,11 @@ def sample(
     per_star = cal.sigma_name == SIGMA_NAMES[1]
     stated = priors is not None
     priors = Priors.default(cal.nominal, per_star) if priors is None else priors
+    if not isinstance(priors, Priors):
+        raise SamplingError(
+            f"priors are {type(priors).__name__}: make them with Priors.default(camera), and change "
+            "some with its method replace."
+        )
     if priors.names != (*cal.parameter_names, cal.sigma_name):
         raise SamplingError(
             f"the priors are on {', '.join(priors.names)}, but the calibration has "

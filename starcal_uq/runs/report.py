@@ -52,12 +52,15 @@ def report(
     Raises
     ------
     TypeError
-        If the result has no page, or no PDF, or nothing says where it goes.
+        If the result has no page, or no PDF, or nothing says where it goes, or a run is to go
+        elsewhere.
     MissingExtraError
         If nothing is installed that makes a PDF.
     RunFolderError
         If there is no calibration, a file cannot be read, or files of different runs are mixed.
     """
+    if isinstance(what, Run | str | os.PathLike) and to is not None:
+        raise TypeError("the report of a run is RUN/report.html: copy that file, or leave to out.")
     if isinstance(what, Run):
         return what.pdf() if format == "pdf" else what.report()
     if isinstance(what, str | os.PathLike):

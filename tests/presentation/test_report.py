@@ -422,6 +422,8 @@ def test_a_report_takes_figures_that_are_drawn(run, monkeypatch):
 def test_no_calibration_no_report(tmp_path):
     with pytest.raises(sc.errors.RunFolderError, match="starcal-uq calibrate"):
         sc.report(sc.runs.RunFolder(tmp_path / "empty").create().path)
+    with pytest.raises(TypeError, match=r"RUN/report\.html: copy that file"):
+        sc.report(tmp_path / "empty", tmp_path / "page.html")
 
 
 @pytest.mark.parametrize("model", ["none", "brown_tangential"])
