@@ -28,14 +28,22 @@ _MODULES = tomllib.loads(Path(__file__).with_name("commands.toml").read_text("ut
 
 
 class _Command(TyperCommand):
-    """A command whose help lists options under what they are for."""
+    """A command whose help lists options under what they are for, and arguments as one types them."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        arguments = (one for one in self.get_params(ctx) if one.param_type_name == "argument")
+        words = ((one.required, _word(one)) for one in arguments)
+        return ["[OPTIONS]", *(word if needed else f"[{word}]" for needed, word in words)]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         sections: AnyDict = defaultdict(list)
         for parameter in self.get_params(ctx):
             kind = f"{parameter.param_type_name.capitalize()}s"
             section = getattr(parameter, "rich_help_panel", None) or kind
-            sections[section].append(parameter.get_help_record(ctx))
+            row = parameter.get_help_record(ctx)
+            # Typer adds the type of an argument, in the words of Python.
+            typed_as = kind == "Arguments" and row is not None
+            sections[section].append((_word(parameter), row[1]) if typed_as else row)
         for section, rows in sections.items():
             if any(rows):
                 with formatter.section(section):
@@ -69,7 +77,8 @@ def _command(name: str) -> Any:
     module = import_module(f"starcal_uq.cli.{_MODULES[name]}")
     function = getattr(module, f"{name.replace('-', '_')}_command")
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    alone.command(name, cls=_Command)(unfolded(name, function))
+    wide = {"max_content_width": 100}
+    alone.command(name, cls=_Command, context_settings=wide)(unfolded(name, function))
     return get_command(alone)
 
 
