@@ -41,9 +41,10 @@ class _Command(TyperCommand):
             kind = f"{parameter.param_type_name.capitalize()}s"
             section = getattr(parameter, "rich_help_panel", None) or kind
             row = parameter.get_help_record(ctx)
-            # Typer adds the type of an argument, in the words of Python.
-            typed_as = kind == "Arguments" and row is not None
-            sections[section].append((_word(parameter), row[1]) if typed_as else row)
+            if row is not None and kind == "Arguments":
+                # Typer adds the type, in the words of Python.
+                row = _word(parameter), row[1]
+            sections[section].append(row)
         for section, rows in sections.items():
             if any(rows):
                 with formatter.section(section):
