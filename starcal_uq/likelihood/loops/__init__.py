@@ -10,7 +10,11 @@ in the first cache; a column is a row of `STRIDE` numbers in one buffer.
 `starcal_uq.likelihood.paths` is the door: this package imports Numba.
 """
 
+import logging
+
 from starcal_uq.likelihood.loops.frames import gram, normals
 from starcal_uq.likelihood.loops.pairs import attitudes, pairs
 
 __all__ = ["attitudes", "gram", "normals", "pairs"]
+
+logging.getLogger(__name__).info("Loading loops, which a machine compiles once, in some seconds.")
