@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 from starcal_uq.likelihood.noise_model import QUANTITIES, NoiseModel, log_variance_columns
 
+# Degrees of freedom of the residuals, two a star, from which noise can be seen to vary.
+_LEAST_DOF = 40.0
 _HIGHEST_POWER = 2
 _ROUNDS, _CHOOSING_ROUNDS, _SETTLED = 10, 2, 1e-3
 _NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
@@ -382,6 +384,11 @@ class _Stars(NamedTuple):
         """Sums over the stars of each frame."""
         return np.asarray(np.bincount(self.frame, values, self.n_frames), dtype=np.float64)
 
+    def price(self, n_terms: int) -> float:
+        """What terms must gain by Schwarz's criterion; few stars follow any of them by chance."""
+        few = np.sum(self.share) < _LEAST_DOF
+        return np.inf if few and n_terms else float(n_terms * np.log(len(self.share)))
+
     def highest(self, name: str) -> int:
         """Highest power of a quantity that the stars can tell."""
         distinct = len(np.unique(self.radius if name == "radius" else self.mag))
@@ -405,10 +412,10 @@ class _Fit:
     def varies(self) -> bool:
         return bool(self.terms) or self.frame_dof is not None
 
-    def score(self, n_stars: int) -> float:
+    def score(self, stars: _Stars) -> float:
         """Schwarz's criterion, the larger the better."""
         n_terms = len(self.terms) + (self.frame_dof is not None)
-        return float(2.0 * self.log_likelihood - n_terms * np.log(n_stars))
+        return 2.0 * self.log_likelihood - stars.price(n_terms)
 
     def variance(self, stars: _Stars) -> FloatArray:
         """Variance of every star."""
@@ -425,14 +432,14 @@ def _design(stars: _Stars, terms: tuple[str, ...]) -> FloatArray:
 def _chosen(stars: _Stars) -> _Fit:
     """The fit with the best criterion that is reached from even noise by one quantity at a time."""
     powers, frames = dict.fromkeys(QUANTITIES, 0), False
-    best, n_stars = _fitted(stars, (), False), len(stars.radius)
+    best = _fitted(stars, (), False)
     while True:
         trials = [
             (_fitted(stars, _terms(more), apart), more, apart)
             for more, apart in _near(stars, powers, frames)
         ]
-        found = max(trials, key=lambda trial: trial[0].score(n_stars))
-        if found[0].score(n_stars) <= best.score(n_stars):
+        found = max(trials, key=lambda trial: trial[0].score(stars))
+        if found[0].score(stars) <= best.score(stars):
             return best
         best, powers, frames = found
 
@@ -535,7 +542,7 @@ def _model(
     known = np.zeros(1) if obs.mag is None else obs.mag[np.isfinite(obs.mag)]
     apart = fit.frame_dof is not None
     # Schwarz's criterion, as for the terms.
-    ratio, correlation = (z**2 > np.log(obs.n_stars) for z in axes.z())
+    ratio, correlation = (z**2 > stars.price(1) for z in axes.z())
     return NoiseModel(
         terms=fit.terms,
         coefficients=fit.beta[1:],

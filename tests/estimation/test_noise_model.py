@@ -42,6 +42,16 @@ def scene(sigma, seed=3, **options):
     return c, obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
 
 
+def test_few_stars_have_one_noise_unless_they_say_more():
+    # Fifteen stars follow some quantity by chance: noise of x and y that is correlated by 0.99.
+    found = []
+    for seed in range(24):
+        _, obs, camera = scene(even, seed, n_frames=3, stars_per_frame=5)
+        model = sc.calibrate(obs, camera, effects="noise").noise_model
+        found.append(model.varies)
+    assert not any(found)
+
+
 def test_the_noise_of_every_star_is_found():
     c, obs, camera = scene(all_at_once)
     cal = sc.calibrate(obs, camera, effects="noise")
