@@ -13,7 +13,8 @@ distribution whose degrees of freedom are estimated (Smyth 2004, Stat. Appl. Gen
 repeated until they settle.
 
 A term stays only if it raises twice the log likelihood by more than the logarithm of the number of
-stars (Schwarz's criterion), so that even noise is left as it is.
+stars (Schwarz's criterion), and the residuals have enough degrees of freedom, so that even noise is left as
+it is.
 """
 
 from __future__ import annotations
