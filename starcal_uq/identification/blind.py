@@ -193,7 +193,11 @@ class Level:
     def fits(self) -> bool:
         q, places = len(self.quads), len(self.start) - 1
         whole = len(self.size_rad) == len(self.codes) == q == int(self.start[-1])
-        return whole and places & (places - 1) == 0 and int(self.quads.max()) < len(self.directions)
+        return (
+            whole
+            and places & (places - 1) == 0
+            and int(self.quads.max(initial=-1)) < len(self.directions)
+        )
 
     @cached_property
     def stars(self) -> cKDTree:

@@ -163,7 +163,7 @@ def sample(
     priors = Priors.default(cal.nominal, per_star) if priors is None else priors
     if not isinstance(priors, Priors):
         raise SamplingError(
-            f"priors are {type(priors).__name__}: make them with Priors.default(camera), and change "
+            f"priors are a {type(priors).__name__}: make them with Priors.default(camera), and change "
             "some with its method replace."
         )
     if priors.names != (*cal.parameter_names, cal.sigma_name):

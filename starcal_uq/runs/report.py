@@ -60,7 +60,7 @@ def report(
         If there is no calibration, a file cannot be read, or files of different runs are mixed.
     """
     if isinstance(what, Run | str | os.PathLike) and to is not None:
-        raise TypeError("the report of a run is RUN/report.html: copy that file, or leave to out.")
+        raise TypeError("the report of a run is RUN/report.html: copy that file, or omit `to`.")
     if isinstance(what, Run):
         return what.pdf() if format == "pdf" else what.report()
     if isinstance(what, str | os.PathLike):

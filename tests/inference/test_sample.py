@@ -248,7 +248,7 @@ def test_unsound_calibrations_are_refused() -> None:
     with pytest.raises(SamplingError, match="not positive definite"):
         sample(None, gaussian_calibration(information=-symmetric_inverse(COVARIANCE)), **QUICK)
     priors = Priors.default(gaussian_calibration().nominal.replace(distortion="k1"))
-    with pytest.raises(SamplingError, match=r"priors are dict: .* Priors\.default"):
+    with pytest.raises(SamplingError, match=r"priors are a dict: .* Priors\.default"):
         sample(None, gaussian_calibration(), {"f": (70.0, 0.1)}, **QUICK)  # type: ignore[arg-type]
     with pytest.raises(SamplingError, match=r"Priors\.default"):
         sample(None, gaussian_calibration(), priors, **QUICK)

@@ -17,4 +17,6 @@ from starcal_uq.likelihood.loops.pairs import attitudes, pairs
 
 __all__ = ["attitudes", "gram", "normals", "pairs"]
 
-logging.getLogger(__name__).info("Loading loops, which a machine compiles once, in some seconds.")
+logging.getLogger(__name__).info(
+    "Loading compiled loops; compiling them at first use takes a few seconds."
+)
