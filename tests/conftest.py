@@ -43,7 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
     one file, and two processes that write it at the same moment fail.
     """
     share = tasks.processors() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    tasks.processors = lambda: share if share > 1 else 0
+    tasks.processors = lambda: max(share, 1)
     if not hasattr(config, "workerinput") and version("arviz").startswith("0."):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

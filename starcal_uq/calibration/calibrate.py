@@ -416,6 +416,6 @@ def _enough(workers: int | None, obs: PartitionedObservations) -> int:
     """Processes that are worth their start: none for what one of them does in the same time."""
     if workers is not None:
         return workers
-    several = max(min(processors(), len(obs.parts)), 1)
+    several = min(processors(), len(obs.parts))
     saved = _SECONDS_A_STAR * obs.n_stars * (1.0 - 1.0 / several)
     return several if saved > _MARGIN * _START_S else 0

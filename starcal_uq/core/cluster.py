@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
 
 from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.tasks import Numbered, processes, processors, spread
+from starcal_uq.core.tasks import Numbered, processes, spread, worth_starting
 from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
@@ -123,13 +123,11 @@ def cluster(
 ) -> Iterator[Cluster]:
     """Processes to work with, which end with the block unless they are somebody else's.
 
-    Those of a Dask scheduler (its address, or a client of one), or `workers` of this machine: as
-    many as processors by default; 0 or 1 stays in this one. `caller` is the function that users
-    call, for messages.
+    Those of a Dask scheduler (its address, or a client of one), or those of this machine that are
+    `worth_starting`. `caller` is the function that users call, for messages.
     """
     if scheduler is None:
-        workers = processors() if workers is None else workers
-        with processes(workers if workers > 1 else 0, caller) as executor:
+        with processes(worth_starting(workers), caller) as executor:
             yield Cluster(executor)
         return
     with extra("cluster", "Dask schedulers", "leave the scheduler out"):

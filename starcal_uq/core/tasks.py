@@ -56,13 +56,11 @@ def run_tasks(
     `task`: from the number of a task to its result, which depends on the number alone. `caller`:
     function that users call, for messages.
     `chunk`: tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits
-    for. `workers`: processes; 0 stays in this one, None takes as many as there are processors.
-    `kept`: results of an earlier call, which are not computed again, and to which each new one is
-    added.
+    for. `workers` as for `worth_starting`. `kept`: results of an
+    earlier call, which are not computed again, and to which each new one is added.
     """
     results: dict[int, T] = {} if kept is None else kept.results(n_tasks)
     todo = [number for number in range(n_tasks) if number not in results]
-    workers = min(processors() if workers is None else workers, -(-len(todo) // chunk))
 
     def take(some: Numbered[T]) -> None:
         found = [(todo[place], result) for place, result in some]
@@ -73,7 +71,7 @@ def run_tasks(
             progress(len(results), n_tasks)
 
     try:
-        with processes(workers, caller) as executor:
+        with processes(worth_starting(workers, -(-len(todo) // chunk)), caller) as executor:
             spread(task, todo, take, executor, chunk)
     except KeyboardInterrupt:
         if whole or not results:
@@ -87,6 +85,15 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def worth_starting(workers: int | None = None, pieces: int = sys.maxsize) -> int:
+    """Processes to start for some pieces of work: `workers`, by default as many as processors.
+
+    0, which is this process alone, where there would be one: this one would only wait for it.
+    """
+    several = min(processors() if workers is None else workers, pieces)
+    return several if several > 1 else 0
 
 
 @contextmanager
@@ -129,9 +136,10 @@ def spread(
         TemporaryDirectory(ignore_cleanup_errors=True) as folder,
     ):
         if executor is None:
-            for place, item in enumerate(items):
-                take([(place, function(item))])
-                check()
+            with one_thread():
+                for place, item in enumerate(items):
+                    take([(place, function(item))])
+                    check()
             return
         content, path = _pickled(function), Path(folder, "function.pickle")
         # A file, because a process that dies while it starts would leave this one waiting at a pipe

@@ -20,7 +20,7 @@ from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import NAME
 from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import one_thread, processors, run_tasks
+from starcal_uq.core.tasks import one_thread, run_tasks
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
@@ -105,10 +105,8 @@ def extract_centroids(
     sources, messages = _sources(images)
     detection = DetectionOptions(**options)
     task = _Measure(sources, camera, detection, bayer)
-    if workers is None:
-        workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
-    kept = None
-    if keep is not None and len(sources) >= _WORTH_PROCESSES:
+    kept, many = None, len(sources) >= _WORTH_PROCESSES
+    if keep is not None and many:
         kept = Kept(
             keep, ["centroids", _files(sources), camera, detection, bayer], (_Frame, FrameStars)
         )
@@ -118,7 +116,7 @@ def extract_centroids(
         len(sources),
         caller="starcal_uq.images.extract_centroids",
         chunk=_CHUNK,
-        workers=workers,
+        workers=workers if many or workers is not None else 0,
         progress=progress,
         kept=kept,
         whole=True,

@@ -117,10 +117,10 @@ class Trials(Generic[T]):
         """Run trials 0 .. n_trials - 1; KeyboardInterrupt if they are to be `whole` and are not.
 
         A trial depends on the seed and its number alone: results are the same, bit for bit, for any
-        number of processes, and a longer study begins with a shorter one. `workers`: processes; as
-        many as there are processors by default, 0 for this one alone, where a BLAS with several
-        threads can change the last digits. `progress` is called with (trials done, trials). `keep`
-        is a folder in which results are kept as they are made; a later call resumes from them.
+        number of processes, and a longer study begins with a shorter one. `workers` as for
+        `starcal_uq.core.tasks.worth_starting`. `progress` is called with (trials done, trials).
+        `keep` is a folder in which results are kept as they are made; a later call resumes from
+        them.
         """
         identity = [self.caller, seed, self.trial.args]
         kept = None if keep is None else Kept(keep, identity, self.kinds)

@@ -22,7 +22,7 @@ from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import NAME, installed_versions
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.store import held, take_over
-from starcal_uq.core.tasks import one_thread, processors
+from starcal_uq.core.tasks import one_thread, worth_starting
 from starcal_uq.core.types import AnyDict, PathLike, Progress, floats
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
@@ -194,13 +194,12 @@ def _compute(
     if not todo:
         return False
     batches = batches_of(work.definition, todo)
-    if workers is None:
+    if workers is None and len(batches) < _FEW_BATCHES:
         # A process takes seconds to start: what is done sooner is done here.
-        workers = 0 if len(batches) < _FEW_BATCHES else processors()
+        workers = 0
+    workers = worth_starting(workers, len(batches))
     try:
-        with cluster(
-            scheduler, workers=min(workers, len(batches)), caller="starcal_uq.study"
-        ) as processes:
+        with cluster(scheduler, workers=workers, caller="starcal_uq.study") as processes:
             processes.map(work, batches, keep=keep)
     except KeyboardInterrupt:
         return True

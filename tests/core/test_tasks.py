@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from starcal_uq.core.errors import ClusterError
-from starcal_uq.core.tasks import run_tasks
+from starcal_uq.core.tasks import run_tasks, worth_starting
 from tests.helpers.tasks import numbered
 
 EXPECTED = [(index**2, "1") for index in range(30)]
@@ -31,6 +31,25 @@ def test_results_come_in_order_whoever_computes_them(workers: int) -> None:
     assert found == (EXPECTED, False)
     assert calls[-1] == (30, 30)
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
+
+
+@pytest.mark.parametrize(
+    ("processors", "workers", "pieces", "started"),
+    [
+        (1, None, 9, 0),
+        (4, None, 9, 4),
+        (4, None, 3, 3),
+        (4, None, 1, 0),
+        (1, 2, 9, 2),
+        (4, 1, 9, 0),
+        (4, 0, 9, 0),
+    ],
+)
+def test_processes_are_started_beside_one_that_only_waits(
+    processors: int, workers: int | None, pieces: int, started: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("starcal_uq.core.tasks.processors", lambda: processors)
+    assert worth_starting(workers, pieces) == started
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -101,4 +120,5 @@ def test_long_calls_use_one_blas_thread_and_give_the_others_back() -> None:
         before = threads()
         assert inside() == {1}
         assert inside() == {1}
+        assert run_tasks(lambda _: threads(), 1, caller="f", chunk=1, workers=0) == ([{1}], False)
         assert threads() == before

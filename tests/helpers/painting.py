@@ -55,5 +55,5 @@ def without_painting() -> Iterator[None]:
         patch.setattr(FigureCanvasSVG, "print_svg", _empty)
         patch.setattr(drawing, "draw_figures", _drawn)
         # Another process would paint.
-        patch.setattr(drawing, "processors", lambda: 1)
+        patch.setattr(drawing, "worth_starting", lambda: 0)
         yield

@@ -389,7 +389,7 @@ def test_figures_drawn_ahead_by_another_process_are_the_same(full):
 
 
 def test_another_process_that_fails_or_is_killed_is_no_obstacle(monkeypatch):
-    monkeypatch.setattr("starcal_uq.presentation.report.drawing.processors", lambda: 2)
+    monkeypatch.setattr("starcal_uq.core.tasks.processors", lambda: 2)
     with pytest.raises(ZeroDivisionError), Ahead() as ahead:
         failed, after, there = (
             ahead.begin(math.factorial, n) if n else ahead.begin(os.getpid) for n in (-1, 4, 0)
@@ -402,7 +402,7 @@ def test_another_process_that_fails_or_is_killed_is_no_obstacle(monkeypatch):
         assert ahead.figures() == {}
         1 / 0  # noqa: B018
     assert process not in [child.pid for child in active_children()]
-    monkeypatch.setattr("starcal_uq.presentation.report.drawing.processors", lambda: 1)
+    monkeypatch.setattr("starcal_uq.core.tasks.processors", lambda: 1)
     with Ahead() as ahead:
         assert ahead.begin(math.factorial, 5)() is None
 

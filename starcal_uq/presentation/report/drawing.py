@@ -14,7 +14,7 @@ from multiprocessing import active_children
 from pkgutil import resolve_name
 from typing import Any, TypeVar
 
-from starcal_uq.core.tasks import processes, processors, submit
+from starcal_uq.core.tasks import processes, submit, worth_starting
 from starcal_uq.core.types import Progress
 from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
@@ -83,7 +83,7 @@ class Ahead:
         self._pool: Executor | None = None
 
     def __enter__(self) -> Ahead:
-        self._pool = self._end.enter_context(processes(int(processors() > 1), "run"))
+        self._pool = self._end.enter_context(processes(min(worth_starting(), 1), "run"))
         others = set(active_children())
         # What drawing needs takes a second to load.
         self.begin(_load)
