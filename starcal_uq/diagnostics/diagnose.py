@@ -41,8 +41,8 @@ from starcal_uq.diagnostics.times import (
     unseen_aberration,
 )
 from starcal_uq.diagnostics.verdict.observed import terms
+from starcal_uq.estimation.assemble import raise_unless_good
 from starcal_uq.estimation.effects import with_effects
-from starcal_uq.estimation.fit import fit
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.ties import without_ties
@@ -352,8 +352,7 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     sigmas = cal.sigmas * np.sqrt(obs.n_stars / some.n_stars)
     reference, lowest = cal.theta, cal.chi2
     # Tails beside a noise model are estimated in turns, which end a little beside this optimum.
-    robust = cal.provenance.likelihood != "marginal"
-    if some is not obs or robust or cal.known_effects.fitted:
+    if some is not obs or cal.has_tails or cal.known_effects.fitted:
         try:
             optimum, found = _optimum(some, cal, cal.camera)
         except StarcalError:
@@ -394,20 +393,16 @@ def _few(obs: Observations) -> Observations:
 def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatArray, float]:
     """Estimate and sum of squares that a calibration like this one reaches from a start."""
     method = cal.method if cal.method in METHODS else "efficient"
-    likelihood = cal.provenance.likelihood
-    if likelihood != "marginal" or method not in ("efficient", "three_stage"):
-        effects = "none" if likelihood == "marginal" else "tails"
-        other = calibrate(
-            obs, start, model=start.model, method=method, duplicates="keep", effects=effects
-        )
-        return other.theta, other.chi2
-    found = fit(obs, start, method=method)
-    if cal.known_effects.fitted:
-        return found.theta, found.chi2
-    # The last, small step of a calibration, which is the same for all that end in its optimum.
-    step = (
-        0.5 * cal.compressed.whitening @ cal.compressed.log_determinant_slope
-        if method == "efficient"
-        else 0.0
+    effects = "tails" if cal.has_tails else "none"
+    found = calibrate(
+        obs,
+        start,
+        model=start.model,
+        method=method,
+        duplicates="keep",
+        effects=effects,
+        throw=False,
     )
-    return found.theta - step, found.chi2
+    if not found.undetermined:
+        raise_unless_good(found.status)
+    return found.theta, found.chi2

@@ -266,8 +266,7 @@ def _normals(obs: Observations, cal: Calibration, name: str) -> FrameNormals:
     """Normal equations at the optimum of a model."""
     if name == cal.camera.distortion:
         return FrameNormals.at(obs, cal)
-    found = refit(obs, cal, name)
-    return FrameNormals.around(obs, name, found.theta, found.rotations)
+    return FrameNormals.around(obs, name, *refit(obs, cal, name))
 
 
 def _moved(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -151,35 +151,10 @@ def _pair_estimate(
     return PairEstimate(pair_theta, covariance)
 
 
-@dataclass(frozen=True)
-class Fit:
-    """An estimate and nothing else."""
-
-    theta: FloatArray  # (p,): end of the last stage, px units
-    chi2: float  # Sum of squared residuals there, px^2 or in units of the stated noise
-    rotations: FloatArray  # (K, 3, 3): best attitudes
-
-
 @one_thread()
-def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
-    """Go through the stages of `calibrate` without covariances, compression and whatever else a
-    result holds.
-
-    CalibrationError as for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
-    """
-    likelihood = MarginalLikelihood(obs, camera.distortion)
-    check_count(likelihood, camera)
-    pairs = PairObjective(likelihood.frames, camera.distortion)
-    search, refinement = Search(), None
-    if method == "efficient":
-        search, refinement = _LEADING, Search(tolerance=REFINEMENT_TOLERANCE)
-    stages, status = _stages(pairs, camera, likelihood, search, refinement)
-    return _fitted(likelihood, camera, stages[-1].theta, status)
-
-
-@one_thread()
-def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
-    """Another distortion model on the same stars, from the optics and attitudes of a calibration.
+def refit(obs: Observations, cal: Calibration, model: str) -> tuple[FloatArray, FloatArray]:
+    """Estimate (p,), px units, of another distortion model on the same stars, from the optics and
+    attitudes of a calibration, and the best attitudes (K, 3, 3) there.
 
     CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
@@ -190,21 +165,14 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
     theta = cal.camera.replace(distortion=model).theta
     search = Search(tolerance=_gain(likelihood, _LAST_STEP), seen=False)
     stage = refinement_stage(likelihood, theta, search)
-    try:
-        return _fitted(likelihood, start, stage.theta, stage.status)
-    except CalibrationError:
-        return fit(obs, start)
-
-
-def _fitted(
-    likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status
-) -> Fit:
-    raise_unless_good(check_camera(camera.with_theta(theta), status))
-    sums, attitudes = likelihood.sums(theta)
-    raise_unless_good(
-        check_noise(noise_of(sums.normal.cost, likelihood.frames), camera, Status.CONVERGED)
-    )
-    return Fit(theta, sums.normal.cost, attitudes.rotations)
+    if check_camera(start.with_theta(stage.theta), stage.status).ok:
+        sums, attitudes = likelihood.sums(stage.theta)
+        noise = noise_of(sums.normal.cost, likelihood.frames)
+        if check_noise(noise, start, stage.status).ok:
+            return stage.theta, attitudes.rotations
+    found = _gaussian_fit(obs, start, EstimationSettings())
+    raise_unless_good(found.status)
+    return found.theta, found.rotations
 
 
 def _gain(likelihood: MarginalLikelihood, step: float) -> float:
