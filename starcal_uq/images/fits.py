@@ -25,13 +25,16 @@ _TOLERANCE_SIGMAS, _TOLERANCE = 1e-2, 1e-4
 # are known.
 _LEFT_MOVING = 0.02
 _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
+_NO_PAIRS = np.empty((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class Stamps:
-    """Squares of pixels (n, m, m) around n positions, from first column `x0` and row `y0` (n,) on.
+    """Squares of pixels (m, m, n), rows first, around n positions, from first column `x0` and row
+    `y0` (n,) on.
 
-    `counts` are above the background, 0 where not `fine`; `good` are pixels to use, `fine` those
+    Stars are along the last axis of all arrays here, so that NumPy's inner loops run over stars and
+    not over a few pixels. `counts` are above the background, 0 where not `fine`; `good` are pixels to use, `fine` those
     that are good, or no loss: those between, in a mosaic of colours, hold the mean of their
     neighbours. `variance` (n,) is that of the background, counts squared; `counts_per_e` the
     inverse gain, and 0 leaves photon noise of the star away.
@@ -48,16 +51,16 @@ class Stamps:
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
         names = ("x0", "y0", "counts", "good", "fine", "variance")
-        changes: AnyDict = {name: getattr(self, name)[chosen] for name in names}
+        changes: AnyDict = {name: getattr(self, name)[..., chosen] for name in names}
         return replace(self, **changes)
 
     def whole_within(self, x: FloatArray, y: FloatArray, radius: FloatArray) -> BoolArray:
         """Whether all pixels (n,) within a radius of places in the image, px, are good or no loss."""
-        whole: BoolArray = np.all(self.fine, axis=(1, 2))
-        cut, grid = np.flatnonzero(~whole), np.arange(self.counts.shape[1])
-        u, v = grid + (self.x0 - x)[cut, None], grid + (self.y0 - y)[cut, None]
-        far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
-        whole[cut] = (self.fine[cut] | far).all((1, 2))
+        whole: BoolArray = np.all(self.fine, axis=(0, 1))
+        cut, grid = np.flatnonzero(~whole), np.arange(len(self.counts))[:, None]
+        u, v = grid + (self.x0 - x)[cut], grid + (self.y0 - y)[cut]
+        far = u**2 + v[:, None] ** 2 > radius[cut] ** 2
+        whole[cut] = (self.fine[..., cut] | far).all((0, 1))
         return whole
 
 
@@ -66,8 +69,8 @@ class StarFit:
     """Result of `fit_stars` for n stars: positions in the image, px, and fluxes, counts.
 
     `covariance` (n, 3, 3) of (x, y, flux) is infinite where the pixels do not determine the star;
-    `sigma_px` (n,) is the width of the star image, before integration over pixels; `weight` (n, m,
-    m) the inverse variance of each pixel, 0 where it was not used; `residual` (n, m, m) counts
+    `sigma_px` (n,) is the width of the star image, before integration over pixels; `weight` (m, m,
+    n) the inverse variance of each pixel, 0 where it was not used; `residual` (m, m, n) counts
     minus the other stars of the field that reach into the stamp.
     """
 
@@ -90,13 +93,13 @@ def cut_stamps(frame: PreparedImage, x: FloatArray, y: FloatArray, half_px: int)
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
     variance = floats(frame.noise[y0.clip(0, height - 1), x0.clip(0, width - 1)]) ** 2
     x0, y0 = x0 - half_px, y0 - half_px
-    steps = np.arange(size)
-    columns, rows = (x0[:, None] + steps)[:, None, :], (y0[:, None] + steps)[:, :, None]
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    at = rows.clip(0, height - 1), columns.clip(0, width - 1)
-    good = inside if usable is None else inside & usable[at]
+    steps = np.arange(size)[:, None]
+    columns, rows = x0 + steps, (y0 + steps)[:, None]
+    inside = ((rows >= 0) & (rows < height)) & ((columns >= 0) & (columns < width))
+    at = rows.clip(0, height - 1) * width + columns.clip(0, width - 1)
+    good = inside if usable is None else inside & usable.take(at)
     fine = good if parity is None else good | (inside & ((columns + rows) % 2 != parity))
-    stamp = floats(np.where(fine, counts[at], 0.0))
+    stamp = floats(np.where(fine, counts.take(at), 0.0))
     return Stamps(x0, y0, stamp, good, fine, variance, frame.counts_per_e)
 
 
@@ -106,38 +109,39 @@ def _profiles(
     """Parts of a star's light in each pixel along x and along y, and as further rows their
     `derivatives`.
 
-    Shape (n, 1 + derivatives, m) each; the first derivative is by the position, the second by the
+    Shape (1 + derivatives, m, n) each; the first derivative is by the position, the second by the
     log width.
     """
     from scipy.special import ndtr
 
-    n, m = len(u), stamps.counts.shape[1]
-    inverse = np.concatenate([1.0 / sigma] * 2)[:, None]
-    z = np.arange(-0.5, m) - np.concatenate([u, v])[:, None]
+    n, m = len(u), len(stamps.counts)
+    inverse = np.concatenate([1.0 / sigma] * 2)
+    z = np.arange(-0.5, m)[:, None] - np.concatenate([u, v])
     z *= inverse
-    rows = np.empty((2 * n, 1 + derivatives, m))
-    rows[:, 0] = np.diff(ndtr(z))
+    rows = np.empty((1 + derivatives, m, 2 * n))
+    part = ndtr(z)
+    np.subtract(part[1:], part[:-1], out=rows[0])
     if derivatives:
         density = np.exp(-0.5 * z * z) / _SQRT_2PI
-        np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 1])
-        rows[:, 1] *= inverse
+        np.subtract(density[:-1], density[1:], out=rows[1])
+        rows[1] *= inverse
     if derivatives > 1:
         density *= z
-        np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 2])
-    return rows[:n], rows[n:]
+        np.subtract(density[:-1], density[1:], out=rows[2])
+    return rows[..., :n], rows[..., n:]
 
 
 def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
-    """Sums over pixels of y_a image x_b, (n, a, b), for rows (n, b, m) along x and (n, a, m) along
+    """Sums over pixels of y_a image x_b, (a, b, n), for rows (b, m, n) along x and (a, m, n) along
     y.
     """
     # The star image is a product of two profiles, so that no product with one needs all pixels of
     # all stars at once.
-    return floats(y @ (image @ x.transpose(0, 2, 1)))
+    return floats(np.einsum("avn,bvn->abn", y, np.einsum("vun,bun->bvn", image, x)))
 
 
 def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
-    return floats(py[:, :, None] * px[:, None, :])
+    return floats(py[:, None] * px)
 
 
 def fit_stars(
@@ -146,7 +150,7 @@ def fit_stars(
     y: FloatArray,
     sigma_px: float | FloatArray,
     *,
-    pairs: Any = None,
+    pairs: IntArray = _NO_PAIRS,
     once: bool = False,
 ) -> StarFit:
     """Fit position and flux of each star from x, y (n,) in the image.
@@ -156,15 +160,18 @@ def fit_stars(
     """
     state = _settled(stamps, x, y, sigma_px, pairs=pairs, left_moving=1.0 if once else _LEFT_MOVING)
     u, v, flux, log_sigma = state
-    sigma, others = np.exp(log_sigma), None
-    if pairs is not None and len(pairs):
-        others = np.zeros_like(stamps.counts)
-        _add_others(others, stamps, state, pairs)
+    sigma = np.exp(log_sigma)
+    others = _of_others(stamps, state, pairs, np.arange(len(x)))
     px, py = _profiles(stamps, u, v, sigma, 1)
-    _, weight = _weighted(stamps, flux, px[:, 0], py[:, 0], others)
-    covariance = _inverse(_normal(_derivatives(px, py, flux), weight))
-    residual = stamps.counts if others is None else stamps.counts - others
-    return StarFit(u + stamps.x0, v + stamps.y0, flux, covariance, sigma, weight, residual)
+    _, weight = _weighted(stamps, flux, px[0], py[0], others)
+    inverse, determined = _solve(_normal(px, py, weight), np.eye(3)[..., None])
+    # Light that was moved is flux times the way.
+    some = np.where(flux == 0.0, 1.0, flux)
+    inverse[:2] /= some
+    inverse[:, :2] /= some
+    covariance = np.where(determined & (flux != 0.0), inverse, np.inf).transpose(2, 0, 1)
+    x, y, residual = u + stamps.x0, v + stamps.y0, stamps.counts - others
+    return StarFit(x, y, flux, covariance, sigma, weight, residual)
 
 
 def fit_widths(
@@ -188,17 +195,15 @@ def _settled(
     sigma_px: float | FloatArray,
     *,
     free_sigma: bool = False,
-    pairs: Any = None,
+    pairs: IntArray = _NO_PAIRS,
     left_moving: float = 0.0,
 ) -> FloatArray:
     """Places in the stamps, fluxes and logarithms of the widths, (4, n).
 
     A star is left alone once its own steps are small and those of the stars in its stamp.
     """
-    n, m = stamps.counts.shape[:2]
+    m, _, n = stamps.counts.shape
     state = np.stack([x - stamps.x0, y - stamps.y0, np.zeros(n), np.zeros(n) + np.log(sigma_px)])
-    has_pairs, derivatives = pairs is not None and len(pairs) > 0, 2 if free_sigma else 1
-    others = np.zeros_like(stamps.counts) if has_pairs else None
     moving, part, here, last = np.arange(n), stamps, pairs, np.zeros((2 + free_sigma, n))
     # Rows of the steps in position and width.
     shape = [0, 1, 3][: 2 + free_sigma]
@@ -207,26 +212,20 @@ def _settled(
             break
         u, v, flux, log_sigma = state if part is stamps else state[:, moving]
         sigma = np.exp(log_sigma)
-        px, py = _profiles(part, u, v, sigma, derivatives)
+        px, py = _profiles(part, u, v, sigma, 1 + free_sigma)
         if iteration == 0:
             # The flux is linear: start at its best value.
-            weight = part.good / part.variance[:, None, None]
-            top = _contracted(px[:, :1], weight * part.counts, py[:, :1])
-            state[2] = flux = _ratio(top, _contracted(px[:, :1] ** 2, weight, py[:, :1] ** 2))[
-                :, 0, 0
-            ]
-        light = None
-        if others is not None:
-            others[moving] = 0.0
-            _add_others(others, stamps, state, here)
-            light = others if part is stamps else others[moving]
-        rest, weight = _weighted(part, flux, px[:, 0], py[:, 0], light)
-        jacobian = _derivatives(px, py, flux)
-        normal = _normal(jacobian, weight)
-        gradient = np.einsum("npk,nk->np", jacobian, (rest * weight).reshape(-1, m * m))
-        solution, determined = _solve(normal, gradient[:, :, None])
-        step = np.where(determined, solution[:, :, 0].T, 0.0)
-        done = np.einsum("in,ni->n", step, gradient) < _TOLERANCE_SIGMAS**2
+            weight = part.good / part.variance
+            top = _contracted(px[:1], weight * part.counts, py[:1])
+            state[2] = flux = _ratio(top, _contracted(px[:1] ** 2, weight, py[:1] ** 2))[0, 0]
+        light = _of_others(stamps, state, here, moving) if len(here) else None
+        rest, weight = _weighted(part, flux, px[0], py[0], light)
+        gradient = _gradient(px, py, rest * weight)
+        solution, determined = _solve(_normal(px, py, weight), gradient[:, None])
+        step = np.where(determined & (flux != 0.0), solution[:, 0], 0.0)
+        some = np.where(flux == 0.0, 1.0, flux)
+        done = np.einsum("in,in->n", step, gradient) < _TOLERANCE_SIGMAS**2
+        step[shape] /= some
         # Far from the solution the linear step overshoots.
         step[:2] /= np.maximum(np.hypot(step[0], step[1]) / (0.5 * sigma), 1.0)
         step[shape] = _to_their_end(step[shape], last, moving)
@@ -235,12 +234,12 @@ def _settled(
             # NumPy's `clip` takes longer than so few numbers.
             wider = log_sigma + np.minimum(np.maximum(step[3], -0.3), 0.3)
             state[3, moving] = np.minimum(np.maximum(wider, np.log(0.15)), np.log(0.5 * m))
-        step[2] /= np.where(flux == 0.0, 1.0, flux)
+        step[2] /= some
         done |= np.abs(step).max(axis=0) < _TOLERANCE
         if done.any():
             still = np.zeros(n, dtype=np.bool_)
             still[moving] = ~done
-            if has_pairs:
+            if len(pairs):
                 still[pairs[still[pairs[:, 1]], 0]] = True
                 here = pairs[still[pairs[:, 0]]]
             moving = np.flatnonzero(still)
@@ -265,50 +264,68 @@ def _to_their_end(step: FloatArray, last: FloatArray, moving: IntArray) -> Float
 def _weighted(
     stamps: Stamps, flux: FloatArray, px: FloatArray, py: FloatArray, others: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """What the model leaves over, and the weights that it implies, (n, m, m) each."""
-    bright = _gaussian(px, flux[:, None] * py)
+    """What the model leaves over, and the weights that it implies, (m, m, n) each."""
+    bright = _gaussian(px, flux * py)
     if others is not None:
         bright += others
     rest = stamps.counts - bright
     np.maximum(bright, 0.0, out=bright)
     bright *= stamps.counts_per_e
-    bright += stamps.variance[:, None, None]
+    bright += stamps.variance
     return rest, np.divide(stamps.good, bright, out=bright)
 
 
-def _derivatives(px: FloatArray, py: FloatArray, flux: FloatArray) -> FloatArray:
-    """Derivatives (n, p, m * m) of the star images by x, y, flux and perhaps log width."""
-    f = flux[:, None]
-    found = [
-        _gaussian(f * px[:, 1], py[:, 0]),
-        _gaussian(f * px[:, 0], py[:, 1]),
-        _gaussian(px[:, 0], py[:, 0]),
-    ]
-    if px.shape[1] > 2:
-        found.append(_gaussian(f * px[:, 2], py[:, 0]) + _gaussian(f * px[:, 0], py[:, 2]))
-    return np.stack(found, axis=1).reshape(len(flux), len(found), px.shape[2] ** 2)
+# Derivatives of a star image by x, y, flux and log width (the sum of the last two), those by shape
+# over the flux: which rows of the profiles along x and along y are multiplied.
+_ALONG_X, _ALONG_Y = np.array([1, 0, 0, 2, 0]), np.array([0, 1, 0, 0, 2])
+# Products of two rows of a profile, and where the product of each two is among them.
+_ONE, _TWO = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
+_PRODUCT = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 
 
-def _normal(derivatives: FloatArray, weight: FloatArray) -> FloatArray:
-    """Normal matrices (n, p, p) of derivatives and weights (n, m, m)."""
-    weighted = derivatives * weight.reshape(len(weight), 1, derivatives.shape[2])
-    return floats(weighted @ derivatives.transpose(0, 2, 1))
+def _joined(terms: FloatArray) -> FloatArray:
+    """Sums (p, ...) by the parameters, from those of the terms of their derivatives."""
+    if len(terms) > 3:
+        terms[3] += terms[4]
+    return terms[:4]
+
+
+def _gradient(px: FloatArray, py: FloatArray, image: FloatArray) -> FloatArray:
+    """Sums (p, n) of an image (m, m, n) times the derivatives of a star image of flux 1."""
+    x, y = (rows[: 2 * len(px) - 1] for rows in (_ALONG_X, _ALONG_Y))
+    return _joined(_contracted(px, image, py)[y, x])
+
+
+def _normal(px: FloatArray, py: FloatArray, weight: FloatArray) -> FloatArray:
+    """Normal matrices (p, p, n) of these derivatives, with weights (m, m, n)."""
+    one, two = (rows[: 3 * len(px) - 3] for rows in (_ONE, _TWO))
+    sums = _contracted(px[one] * px[two], weight, py[one] * py[two])
+    terms = 2 * len(px) - 1
+    x, y = (_PRODUCT[rows[:terms, None], rows[:terms]] for rows in (_ALONG_X, _ALONG_Y))
+    return _joined(_joined(sums[y, x]).transpose(1, 0, 2))
 
 
 def explained(stamps: Stamps, fit: StarFit, scale: float) -> FloatArray:
     """Drop of chi squared by a star of `scale` times the width at the fitted place, shape (n,)."""
     px, py = _profiles(stamps, fit.x_px - stamps.x0, fit.y_px - stamps.y0, scale * fit.sigma_px, 0)
-    projected = _contracted(px, fit.weight * fit.residual, py)[:, 0, 0]
-    return _ratio(projected * np.abs(projected), _contracted(px**2, fit.weight, py**2)[:, 0, 0])
+    projected = _contracted(px, fit.weight * fit.residual, py)[0, 0]
+    return _ratio(projected * np.abs(projected), _contracted(px**2, fit.weight, py**2)[0, 0])
 
 
-def _add_others(others: FloatArray, stamps: Stamps, state: FloatArray, pairs: Any) -> None:
-    """Add to each star's stamp the light of the stars that reach into it."""
-    here, there = pairs[:, 0], pairs[:, 1]
-    u, v, flux, log_sigma = state[:, there]
-    du, dv = stamps.x0[there] - stamps.x0[here], stamps.y0[there] - stamps.y0[here]
-    px, py = _profiles(stamps, u + du, v + dv, np.exp(log_sigma), 0)
-    np.add.at(others, here, _gaussian(px[:, 0], np.maximum(flux, 0.0)[:, None] * py[:, 0]))
+def _of_others(stamps: Stamps, state: FloatArray, pairs: IntArray, stars: IntArray) -> FloatArray:
+    """The light (m, m, k) in the stamps of some `stars` (k,) of those that reach into them; `pairs`
+    are sorted.
+    """
+    others = np.zeros((*stamps.counts.shape[:2], len(stars)))
+    if len(pairs):
+        here, there = pairs.T
+        u, v, flux, log_sigma = state[:, there]
+        du, dv = stamps.x0[there] - stamps.x0[here], stamps.y0[there] - stamps.y0[here]
+        px, py = _profiles(stamps, u + du, v + dv, np.exp(log_sigma), 0)
+        first = np.flatnonzero(np.diff(here, prepend=-1))
+        light = _gaussian(px[0], np.maximum(flux, 0.0) * py[0])
+        others[..., np.searchsorted(stars, here[first])] = np.add.reduceat(light, first, axis=2)
+    return others
 
 
 def _ratio(top: FloatArray, bottom: FloatArray) -> FloatArray:
@@ -316,32 +333,34 @@ def _ratio(top: FloatArray, bottom: FloatArray) -> FloatArray:
 
 
 def _solve(normal: FloatArray, right: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Solutions (n, p, q) for normal matrices (n, p, p) and right sides (n, p, q), and which are
+    """Solutions (p, q, n) for normal matrices (p, p, n) and right sides (p, q, n), and which are
     determined, (n,).
 
     The determinant over the product of the diagonal, which is 1 or less, says how nearly singular
-    a matrix is, whatever the units.
+    a matrix is, whatever the units. Gauss-Jordan elimination: no pivoting is needed for positive
+    definite matrices.
     """
+    p, n = len(normal), normal.shape[2]
+    rows, left = np.empty((p, p + right.shape[1], n)), np.ones(n)
+    rows[:, :p], rows[:, p:] = normal, right
     with np.errstate(all="ignore"):
-        left = np.linalg.det(normal) / np.prod(np.diagonal(normal, axis1=1, axis2=2), axis=1)
-    determined = (left > 1e-9) & np.isfinite(left)
-    p = normal.shape[1]
-    whole = np.where(determined[:, None, None], normal, np.eye(p))
-    return floats(np.linalg.solve(whole, right)), determined
-
-
-def _inverse(normal: FloatArray) -> FloatArray:
-    """Inverses (n, p, p), infinite where there is none."""
-    inverse, determined = _solve(normal, np.eye(normal.shape[1])[None])
-    return np.where(determined[:, None, None], inverse, np.inf)
+        for k in range(p):
+            pivot = rows[k, k].copy()
+            left *= pivot / normal[k, k]
+            rows[k] /= pivot
+            factor = rows[:, k].copy()
+            factor[k] = 0.0
+            rows -= factor[:, None] * rows[k]
+    return rows[:, p:], (left > 1e-9) & np.isfinite(left)
 
 
 def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
-    """Pairs (i, j), in both orders, of positions closer than `reach`."""
+    """Pairs (i, j), in both orders and sorted by i, of positions closer than `reach`."""
     from scipy.spatial import cKDTree
 
     pairs: IntArray = cKDTree(np.column_stack([x, y])).query_pairs(reach, output_type="ndarray")
-    return np.concatenate([pairs, pairs[:, ::-1]])
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    return both[np.argsort(both[:, 0], kind="stable")]
 
 
 # Wide enough to bridge the pixels of an undersampled image.
@@ -375,23 +394,23 @@ def window_positions(
     good = np.isfinite(x) & np.isfinite(y)
     if not len(x):
         return x, y, good
-    half, moving, counts = stamps.counts.shape[1] // 2, np.flatnonzero(good), stamps.counts
-    steps, factor = np.arange(2 * half + 1), 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
+    half, moving, counts = len(stamps.counts) // 2, np.flatnonzero(good), stamps.counts
+    steps, factor = np.arange(2 * half + 1)[:, None], 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
     small, fall = np.zeros(len(x)) + step_px**2, -0.5 / window_px**2
     at, last = np.stack([x - stamps.x0, y - stamps.y0]), np.zeros((2, len(x)))
     if len(moving) < len(x):
-        counts = counts[moving]
+        counts = counts[..., moving]
     for _ in range(_WINDOW_ITERATIONS):
         here = at[:, moving]
-        w = steps - here[:, :, None]
-        rows = np.empty((2, len(moving), 2, len(steps)))
-        np.exp(fall[moving, None] * w * w, out=rows[:, :, 0])
-        np.multiply(rows[:, :, 0], w, out=rows[:, :, 1])
+        w = steps - here[:, None]
+        rows = np.empty((2, 2, *w.shape[1:]))
+        np.exp(fall[moving] * w * w, out=rows[:, 0])
+        np.multiply(rows[:, 0], w, out=rows[:, 1])
         moments = _contracted(rows[0], counts, rows[1])
-        light = moments[:, 0, 0]
+        light = moments[0, 0]
         lit = light > 0.0
         scale = factor[moving] / np.where(lit, light, np.inf)
-        step = _to_their_end(scale * np.stack([moments[:, 0, 1], moments[:, 1, 0]]), last, moving)
+        step = _to_their_end(scale * moments.reshape(4, -1)[1:3], last, moving)
         here += step
         at[:, moving] = here
         # A window that has left its square has run away.
@@ -400,7 +419,8 @@ def window_positions(
         on = fine & (np.einsum("qk,qk->k", step, step) > small[moving])
         if not on.any():
             break
-        moving, counts = moving[on], counts[on]
+        if not on.all():
+            moving, counts = moving[on], counts[..., on]
     x, y = at[0] + stamps.x0, at[1] + stamps.y0
     radius = _WINDOW_SIGMAS * window_px
     for place, size in zip((y, x), shape, strict=True):
@@ -417,28 +437,23 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     x, y, whole = window_positions(
         stamps, frame.counts.shape, fit.x_px, fit.y_px, window, fit.sigma_px, steps_px
     )
-    steps = np.arange(2 * half + 1)
-    u, v = (steps + stamps.x0[:, None]) - x[:, None], (steps + stamps.y0[:, None]) - y[:, None]
-    # Moments up to the second along each axis, of the light in the window and of the variance in
-    # its square.
-    powers_u, powers_v = (np.stack([np.ones_like(w), w, w * w], axis=1) for w in (u, v))
-    wu, wv = (np.exp(-0.5 * w * w / window[:, None] ** 2)[:, None, :] for w in (u, v))
-    sums = _contracted(powers_u * wu, stamps.counts, powers_v * wv)
-    light = sums[:, 0, 0]
+    sums = window_moments(stamps, stamps.counts, x, y, window)
+    light = sums[0, 0]
     variance = np.maximum(stamps.counts, 0.0)
     variance *= stamps.counts_per_e
-    variance += stamps.variance[:, None, None]
+    variance += stamps.variance
     variance *= stamps.good
     if frame.parity is not None:
         # What half of the pixels have measured counts for twice as many.
         variance *= 2.0
-    spread = _second_moments(_contracted(powers_u * wu**2, variance, powers_v * wv**2))
+    # The square of the window is a narrower window.
+    spread = _second_moments(window_moments(stamps, variance, x, y, window / np.sqrt(2.0)))
     near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
     use = (
         whole
         & (light > 0.0)
         & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0)
-        & stamps.good.all((1, 2))
+        & stamps.good.all((0, 1))
     )
     use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
     gradient = _window_gradient(sums, window, fit, use)
@@ -452,9 +467,21 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     )
 
 
+def window_moments(
+    stamps: Stamps, image: FloatArray, x: FloatArray, y: FloatArray, window_px: float | FloatArray
+) -> FloatArray:
+    """Moments of stamps (m, m, n) in Gaussian windows around positions (n,) in the image, up to the
+    second along each axis: (power of v, power of u, n).
+    """
+    steps = np.arange(len(image))[:, None]
+    w = np.stack([steps - (x - stamps.x0), steps - (y - stamps.y0)])
+    rows = np.exp(-0.5 * (w / window_px) ** 2) * np.stack([np.ones_like(w), w, w * w])
+    return _contracted(rows[:, 0], image, rows[:, 1])
+
+
 def _second_moments(sums: FloatArray) -> FloatArray:
-    """Sums of uu, uv and vv as matrices (n, 2, 2), from sums (n, power of v, power of u)."""
-    rows = [sums[:, 0, 2], sums[:, 1, 1], sums[:, 1, 1], sums[:, 2, 0]]
+    """Sums of uu, uv and vv as matrices (n, 2, 2), from sums (power of v, power of u, n)."""
+    rows = [sums[0, 2], sums[1, 1], sums[1, 1], sums[2, 0]]
     return np.stack(rows, axis=1).reshape(-1, 2, 2)
 
 
@@ -474,7 +501,7 @@ def _window_gradient(
     star, window = fit.sigma_px[first] ** 2 + 1.0 / 12.0, window[first]
     moments = (star * window**2 / (star + window**2))[:, None, None] * np.eye(2)
     if np.count_nonzero(bright) >= _GRADIENT_STARS:
-        second = _second_moments(sums[bright]) / sums[bright, :1, :1]
+        second = _second_moments(sums[..., bright] / sums[0, 0, bright])
         moments = np.broadcast_to(median_of(np.moveaxis(second, 0, -1)), moments.shape)
     # Light without a peak does not hold the window; the floor keeps the errors finite.
     values, axes = np.linalg.eigh(np.eye(2) - moments / window[:, None, None] ** 2)

@@ -9,7 +9,15 @@ import numpy as np
 
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.images.background import PreparedImage
-from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, fit_widths
+from starcal_uq.images.fits import (
+    Stamps,
+    StarFit,
+    cut_stamps,
+    explained,
+    fit_stars,
+    fit_widths,
+    window_moments,
+)
 from starcal_uq.maths.intervals import median_of
 
 FIRST_SIGMA_PX = 1.2
@@ -107,12 +115,12 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
         width = float(np.clip(median_of(widths[good]), *_WIDTHS))
     fit = fit_stars(stamps, x, y, width, once=True)
     # Fainter stars that are found are those whose noise adds light.
-    good &= stamps.fine.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
+    good &= stamps.fine.all((0, 1)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
     if np.count_nonzero(good) <= 3:
         return Psf(sigma)
     return Psf(
         sigma,
-        _significant(stamps.counts[good].sum((1, 2)) / fit.flux[good] - 1.0),
+        _significant(stamps.counts[..., good].sum((0, 1)) / fit.flux[good] - 1.0),
         _elongation(stamps, fit, good),
     )
 
@@ -129,17 +137,8 @@ def _elongation(stamps: Stamps, fit: StarFit, good: BoolArray) -> float:
     out.
     """
     window = max(_MOMENT_WINDOW_PX, 1.2 * float(median_of(fit.sigma_px)))
-    steps = np.arange(stamps.counts.shape[1])
-    u, v = (
-        (steps - (fit.x_px - stamps.x0)[good, None]),
-        (steps - (fit.y_px - stamps.y0)[good, None]),
-    )
-    light = stamps.counts[good] * np.exp(
-        -0.5 * (v[:, :, None] ** 2 + u[:, None, :] ** 2) / window**2
-    )
-    total = light.sum((1, 2))
-    xx, yy = np.sum(light.sum(1) * u**2, 1) / total, np.sum(light.sum(2) * v**2, 1) / total
-    xy = np.einsum("nhw,nh,nw->n", light, v, u) / total
+    sums = window_moments(stamps, stamps.counts, fit.x_px, fit.y_px, window)[..., good]
+    xx, yy, xy = sums[[0, 2, 1], [2, 0, 1]] / sums[0, 0]
     mean, half, cross = (
         0.5 * float(median_of(xx + yy)),
         _significant(0.5 * (xx - yy)),
@@ -182,7 +181,7 @@ def _clean_stamps(
     """Which detections have all their pixels and no hot pixel, and their stamps."""
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
     stamps = cut_stamps(frame, x, y, half_stamp_px(sigma))
-    clean = np.flatnonzero(stamps.fine.all((1, 2)) & ~_single_pixels(stamps))[:most]
+    clean = np.flatnonzero(stamps.fine.all((0, 1)) & ~_single_pixels(stamps))[:most]
     return clean.astype(np.int64), stamps.subset(clean)
 
 
@@ -193,10 +192,10 @@ def half_stamp_px(sigma: float) -> int:
 def _single_pixels(stamps: Stamps) -> BoolArray:
     """Stamps in which one pixel holds more than its eight neighbours together: hot pixels."""
     c = stamps.counts.shape[1] // 2
-    box = slice(None), slice(c - 1, c + 2), slice(c - 1, c + 2)
+    box = slice(c - 1, c + 2), slice(c - 1, c + 2)
     core = stamps.counts[box] * stamps.good[box]
-    highest = core.max((1, 2))
-    hot: BoolArray = highest > 0.6 * core.sum((1, 2))
+    highest = core.max((0, 1))
+    hot: BoolArray = highest > 0.6 * core.sum((0, 1))
     return hot
 
 
