@@ -15,7 +15,7 @@ from starcal_uq.diagnostics.residuals import normalised_residuals
 from starcal_uq.estimation.merging import consistency_of, merge
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.observations.repeats import Fingerprints, repeats
+from starcal_uq.observations.repeats import Fingerprints, _crowded, repeats
 from starcal_uq.runs.merge import merge_runs
 from tests.helpers.outside import Campaign, campaign, measured_again
 
@@ -225,3 +225,15 @@ def test_power_and_false_alarms(m: int, least: tuple[float, float, float]) -> No
         print(f"{m} stars, share {share:g}: {alarms} of {4 * n}")
         # Where nearly all of the error is common, two exposures are hardly more than one.
         assert (alarms > 0) == (share == 0.9)
+
+
+def test_no_likeness_is_overlooked_on_the_way_to_the_tree() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-40.0, 40.0, (4, 1500))
+    points[:, 1400:] = points[:, :100] + rng.uniform(-1.0, 1.0, (4, 100))
+    gap = np.abs(points[:, :, None] - points[:, None]).max(axis=0)
+    np.fill_diagonal(gap, np.inf)
+    near = (gap <= 1.0).any(axis=0)
+    kept = _crowded(points)
+    assert near.sum() >= 200 and kept[near].all()
+    assert not kept[~near].all()
