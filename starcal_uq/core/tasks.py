@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -97,16 +98,20 @@ def worth_starting(workers: int | None = None, pieces: int = sys.maxsize) -> int
 
 
 @contextmanager
-def processes(workers: int, caller: str) -> Iterator[Executor | None]:
+def processes(workers: int, caller: str, *, alike: bool = False) -> Iterator[Executor | None]:
     """An executor of processes of this machine, which end with the block; None for 0 of them.
 
-    ClusterError if they end before; `caller` is the function that users call.
+    With `alike` they have what this process has loaded, where that can be done. ClusterError if
+    they end before; `caller` is the function that users call.
     """
     if workers < 1:
         yield None
         return
-    # Forked processes would inherit the locks of threads that they do not have.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start)
+    # Forked processes would inherit the locks of threads that they do not have; those of libraries
+    # are only sure to be free on Linux.
+    forked = alike and sys.platform == "linux" and threading.active_count() == 1
+    context = get_context("fork" if forked else "spawn")
+    pool = ProcessPoolExecutor(workers, context, initializer=_start)
     try:
         yield pool
     except BrokenProcessPool as error:
@@ -171,7 +176,9 @@ def spread(
 
 def submit(executor: Executor, function: Callable[..., T], *arguments: Any) -> Future[T]:
     """Hand a call to an executor, whose processes start then: with one BLAS thread, deaf to Ctrl-C."""
-    with one_thread(), _blocked():
+    with one_thread(), _blocked(), warnings.catch_warnings():
+        # Python 3.12 warns of a fork beside the threads of BLAS, which is prepared for it.
+        warnings.simplefilter("ignore", DeprecationWarning)
         return executor.submit(function, *arguments)
 
 
@@ -236,6 +243,8 @@ def one_thread() -> Iterator[None]:
 
 
 def _start() -> None:
+    # A forked process has the handlers of this one.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if not hasattr(signal, "pthread_sigmask"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -95,6 +95,34 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Pat
     assert 'call validate below `if __name__ == "__main__":`' in done.stderr
 
 
+_ALIKE = """\
+import math, signal, sys
+from starcal_uq.core.tasks import interrupt, processes, submit
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, interrupt)
+    math.mark = 7
+    with processes(1, "f", alike=sys.argv[1] == "True") as pool:
+        there = submit(pool, eval, "getattr(__import__('math'), 'mark', 0)").result()
+        print(there, submit(pool, signal.getsignal, signal.SIGTERM).result() is signal.SIG_DFL)
+"""
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_a_process_alike_has_what_is_loaded_and_not_the_handlers(
+    alike: bool, tmp_path: Path, root: Path
+) -> None:
+    script = tmp_path / "alike.py"
+    script.write_text(_ALIKE)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(script), str(alike)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    there = 7 if alike and sys.platform == "linux" else 0
+    assert (done.stdout.split(), done.stderr) == ([str(there), "True"], "")
+
+
 def test_a_local_function_cannot_go_to_workers() -> None:
     with pytest.raises(ClusterError, match="top level, or use workers=0"):
         run_tasks(lambda index: index, 20, caller="f", chunk=2, workers=2)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import ExitStack, suppress
 from functools import partial, reduce
+from importlib import import_module
 from importlib.resources import files
 from multiprocessing import active_children
 from pkgutil import resolve_name
@@ -30,6 +31,8 @@ AFTER = {step: tuple(figures) for step, figures in _STEPS.items()}
 # The frames of a run from images stand among the figures by this name: a piece of a page, not a
 # picture.
 GALLERY = "gallery"
+# What both processes need is loaded once where they part by a fork.
+_SHARED = ("starcal_uq.diagnostics.diagnose", "scipy.ndimage", "scipy.optimize", "scipy.spatial")
 FIGURES = tuple(name for names in AFTER.values() for name in names)
 
 
@@ -83,7 +86,10 @@ class Ahead:
         self._pool: Executor | None = None
 
     def __enter__(self) -> Ahead:
-        self._pool = self._end.enter_context(processes(min(worth_starting(), 1), "run"))
+        n_others = min(worth_starting(), 1)
+        for name in _SHARED * n_others:
+            import_module(name)
+        self._pool = self._end.enter_context(processes(n_others, "run", alike=True))
         others = set(active_children())
         # What drawing needs takes a second to load.
         self.begin(_load)
