@@ -46,7 +46,7 @@ test-other: .venv/.made ## fast tests of what depends on Python and ArviZ, on a 
 	else echo "second interpreter: none, so only one generation of ArviZ is tested"; fi
 
 test-second: .venv-alt/.installed
-	$(ALT_BIN)/python $(PYTEST) -m "not slow" $(OTHER_TESTS) --deselect tests/test_project.py::test_a_wrong_call_fails_the_type_check
+	$(ALT_BIN)/python $(PYTEST) -m "not slow" $(OTHER_TESTS)
 	$(ALT_BIN)/python -m pytest -m slow tests/test_notebook.py::test_the_page_on_own_tools_runs
 
 test-slow: .venv/.installed-test ## the Monte Carlo tests
