@@ -237,188 +237,150 @@ _CAMERA = (
 _DEEP = "[" * 100_000 + "]" * 100_000
 CALIBRATE = r"; run `starcal-uq calibrate` again\.$"
 SAMPLE = r"; run `starcal-uq sample RUN --force` again\.$"
-# What once ended in a traceback, in a wrong reason, or in numbers: the file, what was done to it,
-# and the sentence.
-ONCE = [
-    (
-        "camera.toml",
-        lambda d: _CAMERA % (b"[" * 3000 + b"]" * 3000),
-        "nests its values too deeply; write plain tables",
-    ),
-    (
-        "camera.toml",
-        lambda d: _CAMERA % (b"{a=" * 3000 + b"1" + b"}" * 3000),
-        "nests its values too deeply",
-    ),
-    (
-        "camera.toml",
-        lambda d: _CAMERA % (b"1" * 5000),
-        "holds a number with too many digits; correct it",
-    ),
-    ("camera.toml", lambda d: _CAMERA % (b"1" * 4000), r"focal_mm is 1{1,60}\.\.\.1+; write"),
-    ("camera.toml", lambda d: _CAMERA % b'"\\u0007"', "focal_mm is '\\\\x07'; write"),
-    ("sensor.toml", lambda d: b"[sensor]\n" + b"1" * 5000 + b" = 2\n", r"key 1+\.\.\.1+"),
-    ("calibration.npz", lambda d: b"", r"\(the file is empty\)" + CALIBRATE),
-    ("calibration.npz", lambda d: d[:3000], r"\(it is damaged or cut off\)"),
-    ("calibration.npz", _flipped, CALIBRATE),
-    ("calibration.npz", lambda d: b"not an archive", r"\(it is damaged or cut off\)"),
-    ("calibration.npz", lambda d: _members(d, quaternions=None), r"\(quaternions is missing\)"),
-    (
-        "calibration.npz",
-        lambda d: _members(d, theta=_declared((10**12,))),
-        r"\(theta declares another size than it has\)",
-    ),
-    (
-        "calibration.npz",
-        lambda d: _members(d, theta=_declared((2**62, 4))),
-        r"\(theta declares another size than it has\)",
-    ),
-    (
-        "calibration.npz",
-        lambda d: _members(d, theta=_npy(np.array([{}]))),
-        r"\(theta holds Python objects\)",
-    ),
-    (
-        "calibration.npz",
-        lambda d: _members(d, theta=_npy(np.ones(5) + 1j)),
-        r"\(theta does not hold what it should\)",
-    ),
-    (
-        "calibration.npz",
-        lambda d: _members(d, theta=_npy(np.full(5, np.nan))),
-        r"\(theta holds a value that is not finite\)",
-    ),
-    (
-        "calibration.npz",
-        lambda d: _members(d, theta=_npy(np.ones(4))),
-        r"\(theta has 4 entries where there should be 5\)",
-    ),
-    ("calibration.json", lambda d: b"", r"\(the file is empty\)"),
-    ("calibration.json", lambda d: d[: len(d) // 2], r"\(line \d+ is no JSON\)"),
-    ("calibration.json", lambda d: _DEEP.encode(), r"\(its values are nested too deeply\)"),
-    ("diagnosis.json", lambda d: _DEEP.encode(), "nested too deeply"),
-    ("images.json", lambda d: b"[1, 2]", r"\(the document is \[1, 2\], not a table\)"),
-    (
-        "calibration.json",
-        lambda d: d.replace(b'"sigma_name": "sigma', b'"sigma_name": "\\ud800'),
-        "which no file can hold",
-    ),
-    ("posterior.nc", _hdf5(_other_names), r"\(its priors are those of other parameters\)" + SAMPLE),
-    ("posterior.nc", lambda d: b"", r"\(the file is empty\)"),
-    ("posterior.nc", lambda d: d[:-1000], r"\(it is cut off, or not of this version\)"),
-    ("posterior.nc", _hdf5(_nan_draw), r"\(draws holds a value that is not finite\)"),
-    ("posterior.nc", _flipped, r"\(its content was changed after it was written\)"),
-    ("posterior.nc", _hdf5(_huge_draws), r"\(it declares 8e\+12 bytes of content, far more"),
-    (
-        "study.nc",
-        _hdf5(lambda f: f.pop("status")),
-        r"\(status is missing\); run `starcal-uq study` again\.$",
-    ),
-    ("study.nc", _hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
-    ("study.nc", _hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
-    (
-        "study.toml",
-        lambda d: d.replace(b"k1 = 2.0e-10", b"k1 = 1e300"),
-        r"key k1 is 1e\+300; write the coefficient, a ",
-    ),
-    (
-        "study.toml",
-        lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
-        r"key seeds is 9+; write a whole number",
-    ),
-    (
-        "validation.npz",
-        lambda d: _document(d, '"n_ranked": ', '"n_ranked": -'),
-        r"\(n_ranked is -\d+, no number of draws\); run `starcal-uq validate CAMERA`",
-    ),
-    ("comparison.json", lambda d: re.sub(rb'"worst_ratio": [^,}]*', b'"worst_ratio": 0', d), None),
-    (
-        "checkpoint.npz",
-        lambda d: _members(d, place=_npy(np.zeros(2) + 1j)),
-        "the draws are made again",
-    ),
-    (
-        "checkpoint.npz",
-        lambda d: _members(d, place=_npy(np.zeros(2, "M8[s]"))),
-        "the draws are made again",
-    ),
-    (
-        "tiles.fits",
-        lambda d: d.replace(b"NAXIS2  =                   40", b"NAXIS2  =                    0"),
-        "the image has no pixels; leave it out",
-    ),
-    ("checkpoint.npz", lambda d: _members(d, key=None), "the draws are made again"),
-    (
-        "run.json",
-        lambda d: d.replace(b'"gone": []', b'"gone": ["../kept.csv"]'),
-        "of the run names a file elsewhere",
-    ),
-    (
-        "run.json",
-        lambda d: d.replace(b'"stage": ""', b'"stage": "/tmp"'),
-        "of the run names a file elsewhere",
-    ),
-    ("checkpoint.npz", lambda d: d[:200], "the draws are made again"),
-    (
-        "observations.parquet",
-        _parquet(_null),
-        "row 1, column frame: the value is missing; fill it in or remove the row",
-    ),
-    (
-        "observations.parquet",
-        _parquet(lambda t: t.append_column("frame", t.column(0))),
-        "column frame occurs twice",
-    ),
-    (
-        "observations.parquet",
-        _meta(b"starcal_uq", b"{"),
-        r"\(line 1 is no JSON\); write it again\.$",
-    ),
-    ("observations.parquet", _meta(b"starcal_uq", b"\xff"), r"\(its text is not UTF-8\)"),
-    ("observations.parquet", _meta(b"starcal_uq", b"[1]"), r"\(its metadata are no table\)"),
-    ("observations.parquet", _meta(b"starcal_uq", _DEEP.encode()), "nested too deeply"),
-    ("observations.parquet", _meta(b"other", b"{"), None),
-    (
-        "stream.parquet",
-        _parquet(lambda t: t.append_column("x_px", t.column(1))),
-        "column x_px occurs twice",
-    ),
-    ("part.parquet", _meta(b"starcal_uq", b"1.5"), r"\(its metadata are no table\)"),
-    (
-        "centroids.parquet",
-        _meta(b"starcal_uq_centroids", None),
-        "the list of frames is missing; give a table",
-    ),
-    ("centroids.parquet", _meta(b"starcal_uq_centroids", b"{}"), "list of frames is missing"),
-    ("profile.parquet", lambda d: b"", r"\(the file is empty\)"),
-    (
-        "observations.ecsv",
-        _header_only,
-        "the table has a header but no rows; give a table with observations",
-    ),
-    (
-        "observations.ecsv",
-        lambda d: d.replace(b"datatype:", b"datatipe:"),
-        "the ECSV header is not valid YAML",
-    ),
-    ("catalogue.ecsv", _header_only, "holds no stars"),
-    ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not valid YAML"),
-    ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"the file has \\x07, x: give"),
-    ("catalogue.csv.gz", lambda d: d[:100], "is not readable as CSV"),
-    (
-        "catalogue.fits",
-        lambda d: d.replace(b"NAXIS   =                    2", b"NAXIS   = " + b"9" * 20),
-        "its header states NAXIS as 9+",
-    ),
-    (
-        "state.npz",
-        lambda d: _members(d, header=None),
-        r"\(header is missing\); give a file written by",
-    ),
-]
 
 
-@pytest.mark.parametrize(("name", "damage", "words"), ONCE)
+def _with(**changed: bytes | None) -> Callable[[bytes], bytes]:
+    return lambda d: _members(d, **changed)
+
+
+def _replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    return lambda d: d.replace(old, new)
+
+
+def _is(content: bytes) -> Callable[[bytes], bytes]:
+    return lambda d: content
+
+
+_EMPTY = _is(b""), r"\(the file is empty\)"
+_OTHER_SIZE = r"\(theta declares another size than it has\)"
+_AGAIN = "the draws are made again"
+_NAXIS, _NAXIS2 = b"NAXIS   =                    2", b"NAXIS2  =                   40"
+# What once ended in a traceback, in a wrong reason, or in numbers, by file: what was done to it, and
+# the sentence; None where a result may come.
+ONCE: dict[str, list[tuple[Callable[[bytes], bytes], str | None]]] = {
+    "camera.toml": [
+        (
+            _is(_CAMERA % (b"[" * 3000 + b"]" * 3000)),
+            "nests its values too deeply; write plain tables",
+        ),
+        (_is(_CAMERA % (b"{a=" * 3000 + b"1" + b"}" * 3000)), "nests its values too deeply"),
+        (_is(_CAMERA % (b"1" * 5000)), "holds a number with too many digits; correct it"),
+        (_is(_CAMERA % (b"1" * 4000)), r"focal_mm is 1{1,60}\.\.\.1+; write"),
+        (_is(_CAMERA % b'"\\u0007"'), "focal_mm is '\\\\x07'; write"),
+    ],
+    "sensor.toml": [(_is(b"[sensor]\n" + b"1" * 5000 + b" = 2\n"), r"key 1+\.\.\.1+")],
+    "calibration.npz": [
+        (_is(b""), r"\(the file is empty\)" + CALIBRATE),
+        (lambda d: d[:3000], r"\(it is damaged or cut off\)"),
+        (_flipped, CALIBRATE),
+        (_is(b"not an archive"), r"\(it is damaged or cut off\)"),
+        (_with(quaternions=None), r"\(quaternions is missing\)"),
+        (_with(theta=_declared((10**12,))), _OTHER_SIZE),
+        (_with(theta=_declared((2**62, 4))), _OTHER_SIZE),
+        (_with(theta=_npy(np.array([{}]))), r"\(theta holds Python objects\)"),
+        (_with(theta=_npy(np.ones(5) + 1j)), r"\(theta does not hold what it should\)"),
+        (_with(theta=_npy(np.full(5, np.nan))), r"\(theta holds a value that is not finite\)"),
+        (_with(theta=_npy(np.ones(4))), r"\(theta has 4 entries where there should be 5\)"),
+    ],
+    "calibration.json": [
+        _EMPTY,
+        (lambda d: d[: len(d) // 2], r"\(line \d+ is no JSON\)"),
+        (_is(_DEEP.encode()), r"\(its values are nested too deeply\)"),
+        (
+            _replaced(b'"sigma_name": "sigma', b'"sigma_name": "\\ud800'),
+            "which no file can hold",
+        ),
+    ],
+    "diagnosis.json": [(_is(_DEEP.encode()), "nested too deeply")],
+    "images.json": [(_is(b"[1, 2]"), r"\(the document is \[1, 2\], not a table\)")],
+    "posterior.nc": [
+        (_hdf5(_other_names), r"\(its priors are those of other parameters\)" + SAMPLE),
+        _EMPTY,
+        (lambda d: d[:-1000], r"\(it is cut off, or not of this version\)"),
+        (_hdf5(_nan_draw), r"\(draws holds a value that is not finite\)"),
+        (_flipped, r"\(its content was changed after it was written\)"),
+        (_hdf5(_huge_draws), r"\(it declares 8e\+12 bytes of content, far more"),
+    ],
+    "study.nc": [
+        (
+            _hdf5(lambda f: f.pop("status")),
+            r"\(status is missing\); run `starcal-uq study` again\.$",
+        ),
+        (_hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
+        (_hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
+    ],
+    "study.toml": [
+        (
+            _replaced(b"k1 = 2.0e-10", b"k1 = 1e300"),
+            r"key k1 is 1e\+300; write the coefficient, a ",
+        ),
+        (
+            lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
+            r"key seeds is 9+; write a whole number",
+        ),
+    ],
+    "validation.npz": [
+        (
+            lambda d: _document(d, '"n_ranked": ', '"n_ranked": -'),
+            r"\(n_ranked is -\d+, no number of draws\); run `starcal-uq validate CAMERA`",
+        )
+    ],
+    "comparison.json": [
+        (lambda d: re.sub(rb'"worst_ratio": [^,}]*', b'"worst_ratio": 0', d), None)
+    ],
+    "checkpoint.npz": [
+        (_with(place=_npy(np.zeros(2) + 1j)), _AGAIN),
+        (_with(place=_npy(np.zeros(2, "M8[s]"))), _AGAIN),
+        (_with(key=None), _AGAIN),
+        (lambda d: d[:200], _AGAIN),
+    ],
+    "run.json": [
+        (_replaced(b'"gone": []', b'"gone": ["../kept.csv"]'), "names a file elsewhere"),
+        (_replaced(b'"stage": ""', b'"stage": "/tmp"'), "names a file elsewhere"),
+    ],
+    "observations.parquet": [
+        (
+            _parquet(_null),
+            "row 1, column frame: the value is missing; fill it in or remove the row",
+        ),
+        (_parquet(lambda t: t.append_column("frame", t.column(0))), "column frame occurs twice"),
+        (_meta(b"starcal_uq", b"{"), r"\(line 1 is no JSON\); write it again\.$"),
+        (_meta(b"starcal_uq", b"\xff"), r"\(its text is not UTF-8\)"),
+        (_meta(b"starcal_uq", b"[1]"), r"\(its metadata are no table\)"),
+        (_meta(b"starcal_uq", _DEEP.encode()), "nested too deeply"),
+        (_meta(b"other", b"{"), None),
+    ],
+    "stream.parquet": [
+        (_parquet(lambda t: t.append_column("x_px", t.column(1))), "column x_px occurs twice")
+    ],
+    "part.parquet": [(_meta(b"starcal_uq", b"1.5"), r"\(its metadata are no table\)")],
+    "centroids.parquet": [
+        (_meta(b"starcal_uq_centroids", None), "the list of frames is missing; give a table"),
+        (_meta(b"starcal_uq_centroids", b"{}"), "list of frames is missing"),
+    ],
+    "profile.parquet": [_EMPTY],
+    "observations.ecsv": [
+        (_header_only, "the table has a header but no rows; give a table with observations"),
+        (_replaced(b"datatype:", b"datatipe:"), "the ECSV header is not valid YAML"),
+    ],
+    "catalogue.ecsv": [(_header_only, "holds no stars")],
+    "centroids.ecsv": [(lambda d: d.split(b"\n")[0] + b"\n", "is not valid YAML")],
+    "observations.csv": [(_is(b"\x07,x\n1,2\n"), r"the file has \\x07, x: give")],
+    "catalogue.csv.gz": [(lambda d: d[:100], "is not readable as CSV")],
+    "tiles.fits": [
+        (_replaced(_NAXIS2, _NAXIS2[:-2] + b" 0"), "the image has no pixels; leave it out")
+    ],
+    "catalogue.fits": [
+        (_replaced(_NAXIS, b"NAXIS   = " + b"9" * 20), "its header states NAXIS as 9+")
+    ],
+    "state.npz": [(_with(header=None), r"\(header is missing\); give a file written by")],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "words"),
+    [(name, damage, words) for name, cases in ONCE.items() for damage, words in cases],
+)
 def test_what_once_went_wrong_is_one_sentence(
     bench: Bench, name: str, damage: Callable[[bytes], bytes], words: str | None
 ) -> None:

@@ -1,6 +1,6 @@
 """What becomes of damaged files: the long campaign, by one command.
 
-    python -m tests.damage.campaign [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2]
+    python -m verification.damage [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2]
     [--show] [--write]
 
 Every kind of file that the package reads (`tests/damage/samples.py`) is damaged, a seed each, and
@@ -36,7 +36,7 @@ from benchmarks.pages import put
 from tests.damage.judging import Bench, Outcome
 from tests.damage.samples import LAST, SAMPLES, Sample, write_samples
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / ".bench" / "damage"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 # A process takes seconds to load what it needs.
@@ -113,7 +113,7 @@ def _tried(name: str, first: int, last: int, out: Path, folder: Path) -> dict[st
     command = [
         sys.executable,
         "-m",
-        "tests.damage.campaign",
+        "verification.damage",
         "--work",
         str(folder),
         name,

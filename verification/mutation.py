@@ -1,6 +1,6 @@
 """Do the tests notice when the mathematics is changed? Mutation testing by one command.
 
-    python -m tests.damage.sources [--seed N] [--subject NAME ...] [--again] [--show] [--write]
+    python -m verification.mutation [--seed N] [--subject NAME ...] [--again] [--show] [--write]
 
 A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. A seed
 draws one of each function of a subject; a later seed leaves out what those before it draw, so its
@@ -49,7 +49,7 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / ".bench" / "mutation"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.damage import sources as mutation
+from verification import mutation
 
 pytestmark = pytest.mark.slow
 
