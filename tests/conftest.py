@@ -16,8 +16,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Caches of the tests stay out of the home folder.
 os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "starcal_uq-test-cache")
 
-import warnings
 from collections.abc import Iterator
+from datetime import date
 from functools import cache
 from importlib.metadata import distributions, requires, version
 from pathlib import Path
@@ -25,6 +25,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 from packaging.requirements import Requirement
+from platformdirs import user_cache_dir
 
 from starcal_uq.core import tasks
 
@@ -39,15 +40,15 @@ def pytest_configure(config: pytest.Config) -> None:
     """Divide the processors among the test processes: one that has a single processor starts no
     others, each of which takes seconds to load, unless a test gives their number.
 
-    Let ArviZ 0.23 print its once-a-day notice before the test processes start: it keeps the date in
-    one file, and two processes that write it at the same moment fail.
+    Write down that ArviZ 0.23 has given its notice of the day: it keeps the date in one file, and
+    two processes that write it at the same moment fail.
     """
     share = tasks.processors() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     tasks.processors = lambda: max(share, 1)
     if not hasattr(config, "workerinput") and version("arviz").startswith("0."):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import arviz  # noqa: F401
+        noticed = Path(user_cache_dir("arviz", "arviz"), "daily_warning")
+        noticed.parent.mkdir(parents=True, exist_ok=True)
+        noticed.write_text(date.today().isoformat())
 
 
 @pytest.fixture
