@@ -26,18 +26,13 @@ from tests.helpers.outside import campaign
 
 
 def test_simulate_writes_a_table_that_calibrates(cli, inputs, tmp_path):
-    status, out, _ = cli(
-        "simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5
-    )
-    assert status == 0
+    words = "simulate inputs/camera.toml -o obs.parquet --frames 30"
+    out, _ = cli.ok(f"{words} --seed 5")
     assert "30 frames" in out
     first = (tmp_path / "obs.parquet").read_bytes()
-    status, _, err = cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30)
-    assert status == 2
-    assert "--force" in err
+    cli.refuses("--force", words)
     assert (tmp_path / "obs.parquet").read_bytes() == first
-    status, out, err = cli("calibrate", "obs.parquet", inputs / "camera.toml", "-o", "run")
-    assert status == 0
+    out, err = cli.ok("calibrate obs.parquet inputs/camera.toml -o run")
     assert "truth" in out
     assert "warning" not in err
 
@@ -63,7 +58,7 @@ def test_help_teaches(cli):
 def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_command_that_writes_it(
     cli, inputs
 ):
-    out = cli("run", "--help-all")[1]
+    out = cli("run --help-all")[1]
     panels = (
         "Options",
         "How a camera is estimated",
@@ -75,30 +70,19 @@ def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_comm
         places == sorted(places)
         and places[1] < out.index("--effects") < places[2] < out.index("--gain") < places[3]
     )
-    status, _, err = cli("calibrate", inputs / "obs.csv", "site/camera.toml", "-o", "run")
-    assert (
-        status == 2
-        and "site/camera.toml': does not exist; check the path, or starcal-uq new camera" in err
+    cli.refuses(
+        "site/camera.toml': does not exist; check the path, or starcal-uq new camera",
+        "calibrate inputs/obs.csv site/camera.toml -o run",
     )
-    assert "starcal-uq new" not in cli("calibrate", inputs / "obs.csv", "mine.toml", "-o", "run")[2]
-    said = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--only-frames", "a"
-    )[2]
-    assert "is no list of frame numbers" in said
-
-
-def _line(path, number, text):
-    lines = path.read_text().splitlines()
-    lines[number - 1] = text
-    path.write_text("\n".join(lines) + "\n")
+    assert "starcal-uq new" not in cli("calibrate inputs/obs.csv mine.toml -o run")[2]
+    words = "calibrate inputs/obs.csv inputs/camera.toml -o run --only-frames a"
+    cli.refuses("is no list of frame numbers", words)
 
 
 def _cell(path, number, column, text):
-    lines = path.read_text().splitlines()
-    index = lines[0].split(",").index(column)
-    cells = lines[number - 1].split(",")
-    cells[index] = text
-    _line(path, number, ",".join(cells))
+    table = [line.split(",") for line in path.read_text().splitlines()]
+    table[number - 1][table[0].index(column)] = text
+    path.write_text("\n".join(map(",".join, table)) + "\n")
 
 
 def _cells(number, column, text):
@@ -124,14 +108,8 @@ def test_every_mistake_is_one_sentence_and_touches_nothing(cli, inputs, tmp_path
     spoil, words = MISTAKES[mistake]
     spoil(inputs)
     before = files(tmp_path)
-    status, out, err = cli(command, inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
-    assert status == 2
-    lines = [line for line in err.splitlines() if line.strip()]
-    assert len(lines) == 1, err
-    assert lines[0].startswith("error: ")
-    for word in words:
-        assert word in lines[0], (word, lines[0])
-    assert "Traceback" not in err + out
+    err = cli.refuses("", f"{command} inputs/obs.csv inputs/camera.toml -o run")
+    assert len(err.splitlines()) == 1 and all(word in err for word in words), err
     assert files(tmp_path) == before
 
 
@@ -139,34 +117,22 @@ def test_output_that_exists_is_kept(cli, inputs, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine.txt").write_text("keep me")
     before = files(tmp_path)
-    status, _, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
-    assert status == 2
-    assert "--force" in err
+    cli.refuses("--force", "run inputs/obs.csv inputs/camera.toml -o run")
     assert files(tmp_path) == before
-    status, _, err = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--force"
-    )
-    assert status == 0
+    _, err = cli.ok("calibrate inputs/obs.csv inputs/camera.toml -o run --force")
     assert "Neither time nor observer velocity was declared" in err
     assert (tmp_path / "run" / "mine.txt").read_text() == "keep me"
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "words"),
-    [
-        ("--directions", "catalogue", "time_utc"),
-        ("--observer-velocity", "1,2", "three numbers"),
-        ("--column", "ra_deg", "NAME=IN_FILE"),
-        ("--column", "ra_deg=nothing", "nothing"),
-    ],
-)
-def test_wrong_options_are_named(cli, inputs, tmp_path, option, value, words):
+def test_wrong_options_are_named(cli, inputs, tmp_path):
     before = files(tmp_path)
-    status, _, err = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", option, value
-    )
-    assert status == 2
-    assert words in err
+    for option, said in (
+        ("--directions catalogue", "time_utc"),
+        ("--observer-velocity 1,2", "three numbers"),
+        ("--column ra_deg", "NAME=IN_FILE"),
+        ("--column ra_deg=nothing", "nothing"),
+    ):
+        cli.refuses(said, f"calibrate inputs/obs.csv inputs/camera.toml -o run {option}")
     assert files(tmp_path) == before
 
 
@@ -185,53 +151,35 @@ def test_files_of_another_kind_are_named_before_any_work(cli, inputs, tmp_path, 
     monkeypatch.chdir(inputs)
     sc.sky.Site(52.0, 4.4, 10.0).save("site.toml")
     (inputs / "bad.png").write_bytes(b"no image")
-    assert cli("calibrate", "obs.csv", "camera.toml", "-o", "made", "--in-space")[0] == 0
+    cli.ok("calibrate obs.csv camera.toml -o made --in-space")
     for call, words in WRONG_FILES.items():
-        status, _, err = cli(*call.split(), "-o", "run")
-        assert (status, len(err.splitlines())) == (2, 1) and err.startswith(f"error: {words}"), err
+        err = cli.refuses("", f"{call} -o run")
+        assert len(err.splitlines()) == 1 and err.startswith(f"error: {words}"), err
     assert not (inputs / "run").exists()
 
 
 def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
-    made = (
-        "simulate",
-        inputs / "camera.toml",
-        "-o",
-        "frames",
-        "--frames",
-        "50",
-        "--min-stars",
-        "5",
-        "--max-mag",
-        "7",
-    )
-    status, out, err = cli(*made, "--partition-frames", "20", "--workers", "0")
-    assert (status, out.split(" stars ")[1]) == (0, "in 50 frames, 3 files: frames\n"), err
-    status, out, err = cli(
-        "calibrate", "frames", inputs / "camera.toml", "-o", "run", "--workers", "0"
-    )
-    assert status == 0 and "in 50 frames" in out, err
-    assert cli("sample", "run", *SMALL)[0] in (0, 1)
-    for words, arguments in (
-        ("give --partition-frames", (*made, "--workers", "2", "--force")),
+    made = "simulate inputs/camera.toml -o frames --frames 50 --min-stars 5 --max-mag 7"
+    out, _ = cli.ok(f"{made} --partition-frames 20 --workers 0")
+    assert out.split(" stars ")[1] == "in 50 frames, 3 files: frames\n"
+    out, _ = cli.ok("calibrate frames inputs/camera.toml -o run --workers 0")
+    assert "in 50 frames" in out
+    cli.ok("sample", "run", *SMALL, among=(0, 1))
+    for said, words in (
+        ("give --partition-frames", f"{made} --workers 2 --force"),
         (
             "needs a folder of partitions",
-            ("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "no", "--workers", "2"),
+            "calibrate inputs/obs.csv inputs/camera.toml -o no --workers 2",
         ),
-        (
-            "--screen needs one table",
-            ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen"),
-        ),
-        ("not empty; name another", (*made, "--partition-frames", "20", "--seed", "9")),
+        ("--screen needs one table", "calibrate frames inputs/camera.toml -o no --screen"),
+        ("not empty; name another", f"{made} --partition-frames 20 --seed 9"),
     ):
-        status, _, err = cli(*arguments)
-        assert status == 2 and words in err, err
+        cli.refuses(said, words)
 
 
 @pytest.mark.parametrize("what", sorted({*get_args(Starter)} - {"example"}))
 def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
-    status, out, _ = cli("new", what)
-    assert status == 0
+    out, _ = cli.ok("new", what)
     assert f"{what}.toml" in out
     assert "#" in (tmp_path / f"{what}.toml").read_text()
     load = {
@@ -243,9 +191,7 @@ def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
         "study": StudyDefinition.load,
     }[what]
     load(tmp_path / f"{what}.toml")
-    status, _, err = cli("new", what)
-    assert status == 2
-    assert "exists already" in err
+    cli.refuses("exists already", "new", what)
 
 
 def test_the_starter_camera_looks_through_the_centre_of_its_detector(cli, tmp_path):
@@ -264,16 +210,11 @@ def test_the_starter_camera_looks_through_the_centre_of_its_detector(cli, tmp_pa
 
 
 def test_the_example_is_written_into_a_folder(cli, tmp_path):
-    status, out, _ = cli("new", "example")
-    assert status == 0 and "starcal-uq run esa/stars.ecsv esa/camera.toml -o RUN" in out
-    assert {path.name for path in (tmp_path / "esa").iterdir()} == {
-        "NOTICE",
-        "camera.toml",
-        "site.toml",
-        "stars.ecsv",
-    }
-    status, _, err = cli("new", "example")
-    assert status == 2 and "exists already" in err
+    out, _ = cli.ok("new example")
+    assert "starcal-uq run esa/stars.ecsv esa/camera.toml -o RUN" in out
+    names = {path.name for path in (tmp_path / "esa").iterdir()}
+    assert names == {"NOTICE", "camera.toml", "site.toml", "stars.ecsv"}
+    cli.refuses("exists already", "new example")
 
 
 def test_python_runs_the_package_and_shells_complete_its_commands():
@@ -323,23 +264,10 @@ def test_a_run_with_priors_goes_to_the_end(tmp_path, cli):
     obs.save(tmp_path / "obs.csv")
     camera.save(tmp_path / "camera.toml")
     (tmp_path / "priors.toml").write_text("[priors]\nprincipal_point_px = 10.0\n")
-    command = [
-        "run",
-        tmp_path / "obs.csv",
-        tmp_path / "camera.toml",
-        "-o",
-        tmp_path / "run",
-        "--in-space",
-    ]
-    sampling = ["--ensembles", "2", "--walkers", "14", "--steps", "40"]
-    status, _, err = cli(*command, *sampling)
-    assert (
-        status == 2
-        and "do not determine" in err
-        and not (tmp_path / "run" / "calibration.json").exists()
-    )
-    status, out, err = cli(*command, *sampling, "--priors", tmp_path / "priors.toml")
-    assert status in (0, 1), err
+    command = "run obs.csv camera.toml -o run --in-space --ensembles 2 --walkers 14 --steps 40"
+    cli.refuses("do not determine", command)
+    assert not (tmp_path / "run" / "calibration.json").exists()
+    out, _ = cli.ok(f"{command} --priors priors.toml", among=(0, 1))
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text("utf-8"))
     assert "estimation (warning, singular)" in " ".join(out.split())
     assert any(

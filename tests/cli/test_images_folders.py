@@ -5,7 +5,6 @@ star.
 from __future__ import annotations
 
 import html
-import json
 import re
 import shlex
 
@@ -19,7 +18,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.pipeline.images import observations_from_images
 from tests.helpers.sky_pictures import SIZE, attitude, picture
 
-FAST = ("--steps", 20, "--draws", 50, "--ensembles", 2)
+FAST = "--steps 20 --draws 50 --ensembles 2"
 
 
 def sheet(path, focal_px, model="brown"):
@@ -46,8 +45,7 @@ def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(
     # What follows the calibration is not asked about.
     monkeypatch.setattr("starcal_uq.runs.whole.finish", lambda *_, **__: None)
     monkeypatch.setattr("starcal_uq.cli.run._conclude", lambda run: Answer({"run": run.path}))
-    status, _, err = cli("run", noisy_frame, "camera.toml", "-o", "run", "--model", "none", *FAST)
-    assert status in (0, 1), err
+    cli.ok(f"run {noisy_frame} camera.toml -o run --model none {FAST}", among=(0, 1))
     assert sc.Run(tmp_path / "run").calibration.camera.distortion == "none"
 
 
@@ -88,9 +86,8 @@ def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path)
     )
     (frames / "text.png").write_text("no picture")
     sheet(tmp_path / "camera.toml", 3000.0)
-    status, _, err = cli("run", "frames", "camera.toml", "-o", "run", "--max-mag", 5)
-    assert status == 2
-    assert "error: no frame is identified: 0 of 3 frames are identified." in err
+    said = "error: no frame is identified: 0 of 3 frames are identified."
+    err = cli.refuses(said, "run frames camera.toml -o run --max-mag 5")
     assert err.rstrip().endswith("Every frame, with its detections and its reason: run/frames.html")
     page = page_of(tmp_path / "run")
     for name in ("noise0.tiff", "noise1.tiff", "dark.tiff", "text.png"):
@@ -102,13 +99,9 @@ def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path)
     assert page.count('<g class="u">') == 2
     # What the page names works, and the folder is no obstacle to another attempt.
     command = shlex.split(re.search(r"(starcal-uq identify [^<]*)<", page)[1])[1:]
-    status, out, err = cli(*command)
-    assert (status, "0 of 3 frames are identified" in out) == (1, True), err
-    status, out, _ = cli("inspect", "run", "--force", "--json")
-    assert [frame["outcome"] for frame in json.loads(out)["frames"]][1:3] == [
-        "not identified",
-        "not identified",
-    ]
+    assert "0 of 3 frames are identified" in cli.ok(*command, among=(1,))[0]
+    shown = cli.document("inspect run --force")["frames"]
+    assert [frame["outcome"] for frame in shown][1:3] == 2 * ["not identified"]
 
 
 @pytest.mark.slow
@@ -117,60 +110,33 @@ def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path)
     rng.integers(4)
     picture(tmp_path / "frame.tiff", attitude(rng), 6000.0, jitter_px=0.4, max_mag=9.0, seed=0)
     sheet(tmp_path / "camera.toml", 6000.0)
-    status, _, err = cli("run", "frame.tiff", "camera.toml", "-o", "run")
-    assert status == 2
-    assert "they do not determine the camera" in err
+    cli.refuses("they do not determine the camera", "run frame.tiff camera.toml -o run")
     assert ">identified, not calibrated<" in page_of(tmp_path / "run")
     # A run of something else takes the place of what has failed.
     Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(
         tmp_path / "dark.tiff"
     )
-    status, _, err = cli("run", "dark.tiff", "camera.toml", "-o", "run")
-    assert (status, "no frame is identified" in err) == (2, True)
-    assert sorted(
-        path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")
-    ) == [
-        "camera.toml",
-        "centroids.parquet",
-        "frames.html",
-        "identification.csv",
-        "images.json",
-        "run.json",
-    ]
+    cli.refuses("no frame is identified", "run dark.tiff camera.toml -o run")
+    left = {path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")}
+    images = {"centroids.parquet", "frames.html", "identification.csv", "images.json"}
+    assert left == {"camera.toml", "run.json", *images}
 
 
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (
-            ("calibrate",),
-            "OBS is missing (stars in pixels): give `starcal-uq calibrate OBS CAMERA -o RUN`.",
+def test_a_call_that_lacks_an_argument_is_answered_with_a_sentence(cli):
+    file, folder = shlex.quote(__file__), "-o RUN is missing (folder for the results): give"
+    for call, said in {
+        "calibrate": (
+            "OBS is missing (stars in pixels): give `starcal-uq calibrate OBS CAMERA -o RUN`."
         ),
-        (
-            ("run", __file__),
-            (
-                "-o RUN is missing (folder for the results): give `starcal-uq run OBS|IMAGES... "
-                "[CAMERA] -o"
-            ),
+        f"run {file}": f"{folder} `starcal-uq run OBS|IMAGES... [CAMERA] -o",
+        f"calibrate {file} {file}": f"{folder} `starcal-uq calibrate",
+        "sample": (
+            "RUN is missing (run folder of `starcal-uq calibrate` or `run`): give `starcal-uq "
+            "sample RUN`."
         ),
-        (
-            ("calibrate", __file__, __file__),
-            "-o RUN is missing (folder for the results): give `starcal-uq calibrate",
-        ),
-        (
-            ("sample",),
-            (
-                "RUN is missing (run folder of `starcal-uq calibrate` or `run`): give `starcal-uq "
-                "sample RUN`."
-            ),
-        ),
-        (("export", __file__), "--to WORD is missing (the camera for opencv"),
-    ],
-)
-def test_a_call_that_lacks_an_argument_is_answered_with_a_sentence(cli, call, said):
-    status, _, err = cli(*call)
-    assert status == 2
-    assert err.startswith(f"error: {said}")
+        f"export {file}": "--to WORD is missing (the camera for opencv",
+    }.items():
+        assert cli.refuses("", call).startswith(f"error: {said}")
 
 
 @pytest.fixture
@@ -217,11 +183,7 @@ def test_frames_of_another_camera_are_left_out(mixed_folder, tmp_path, longer, w
     )
     assert why["small.tiff"].startswith("the image is 300 x 300 px")
     assert [name for name, words in why.items() if not words] == [
-        "0.tiff",
-        "1.tiff",
-        "3.tiff",
-        "4.tiff",
-        "6.tiff",
+        f"{n}.tiff" for n in (0, 1, 3, 4, 6)
     ]
     # No noise of another lens is in that of the frames.
     assert obs.meta.get("noise_floor_px", 0.0) < 0.1
@@ -230,8 +192,7 @@ def test_frames_of_another_camera_are_left_out(mixed_folder, tmp_path, longer, w
 @pytest.mark.slow
 def test_the_command_for_the_other_camera_works(cli, mixed_folder, tmp_path):
     mixed_folder(1.75)
-    status, _, err = cli("run", "frames", "-o", "run", "--directions", "apparent", *FAST)
-    assert status in (0, 1), err
+    _, err = cli.ok(f"run frames -o run --directions apparent {FAST}", among=(0, 1))
     notes = [line for line in err.splitlines() if "of another camera" in line]
     assert [re.search(r"\((.*)\) left out", line)[1] for line in notes] == [
         "300 x 300 px",
@@ -240,13 +201,11 @@ def test_the_command_for_the_other_camera_works(cli, mixed_folder, tmp_path):
     command = shlex.split(notes[1].partition("to calibrate that one: ")[2])
     assert command[:2] == ["starcal-uq", "run"]
     assert command[-4:] == ["--directions", "apparent", "-o", "run-3"]
-    status, _, err = cli(*command[1:], *FAST)
-    assert status in (0, 1), err
+    cli.ok(*command[1:], *FAST.split(), among=(0, 1))
     assert sc.Run(tmp_path / "run-3").calibration.camera.focal_px == pytest.approx(4200.0, rel=1e-3)
     frames = sc.Run(tmp_path / "run").frames
     assert next(frame.row.outcome for frame in frames if frame.row.frame == 2).startswith(
         "another camera took it"
     )
-    page = cli("inspect", "run", "--force")
-    assert page[0] == 0
+    cli.ok("inspect run --force")
     assert "calibrate the frames of that camera by themselves" in page_of(tmp_path / "run")

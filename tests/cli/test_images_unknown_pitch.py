@@ -70,23 +70,12 @@ def stars(tmp_path_factory):
 
 def test_nothing_that_a_run_shows_or_writes_is_in_millimetres(cli, stars, tmp_path):
     camera().save(tmp_path / "camera.toml")
-    fast = ("--steps", 20, "--draws", 50, "--ensembles", 2)
-    status, out, err = cli("run", stars, "camera.toml", "-o", "run", *fast)
-    assert status in (0, 1), err
+    words = f"run {stars} camera.toml -o run --steps 20 --draws 50 --ensembles 2"
+    out, err = cli.ok(words, among=(0, 1))
     assert out.count("--pixel-um") == 1
-    for to in (
-        "opencv",
-        "ros",
-        "kalibr",
-        "mrcal",
-        "tetra3",
-        "sip",
-        "latex",
-        "markdown",
-        "covariance",
-        "csv",
-    ):
-        assert cli("export", "run", "--to", to, "-o", f"run/exported_{to}.txt")[0] == 0
+    formats = "opencv ros kalibr mrcal tetra3 sip latex markdown covariance csv"
+    for to in formats.split():
+        cli.ok(f"export run --to {to} -o run/exported_{to}.txt")
     said = {"terminal": out + err, **dict(texts(tmp_path / "run"))}
     assert "pixels of unknown pitch" in said["report.html"]
     assert len(said) > 20
@@ -94,7 +83,7 @@ def test_nothing_that_a_run_shows_or_writes_is_in_millimetres(cli, stars, tmp_pa
     # The camera that is written is in that state when it is read, in the formats of others as well.
     kept = sc.Camera.load(tmp_path / "run" / "calibrated.toml")
     for to, ending in (("opencv", "yaml"), ("kalibr", "yaml"), ("mrcal", "cameramodel")):
-        assert cli("export", "run/calibrated.toml", "--to", to, "-o", f"{to}.{ending}")[0] == 0
+        cli.ok(f"export run/calibrated.toml --to {to} -o {to}.{ending}")
         other = sc.Camera.load(tmp_path / f"{to}.{ending}")
         assert other.pixel_um is None
         assert other.focal_mm is None
@@ -103,11 +92,10 @@ def test_nothing_that_a_run_shows_or_writes_is_in_millimetres(cli, stars, tmp_pa
 
 def test_the_pitch_can_be_stated(cli, stars, tmp_path):
     camera().save(tmp_path / "camera.toml")
-    status, unknown, _ = cli("calibrate", stars, "camera.toml", "-o", "unknown", "--json")
-    assert status == 0
+    call = f"calibrate {stars} camera.toml"
+    unknown, _ = cli.ok(f"{call} -o unknown --json")
     assert millimetres({"json": unknown}) == {}
-    status, out, err = cli("calibrate", stars, "camera.toml", "-o", "stated", "--pixel-um", PITCH)
-    assert status == 0, err
+    out, _ = cli.ok(f"{call} -o stated --pixel-um {PITCH}")
     # The search for millimetres finds them where there are some.
     assert len(millimetres({"terminal": out})["terminal"]) == 1
     assert millimetres(dict(texts(tmp_path / "stated"))).keys() >= {
@@ -121,13 +109,10 @@ def test_the_pitch_can_be_stated(cli, stars, tmp_path):
     )
     assert with_pitch.camera.focal_px == pytest.approx(without.camera.focal_px, rel=1e-9)
     assert with_pitch.camera.focal_mm == pytest.approx(35.2866, abs=0.01)
-    status, _, err = cli("calibrate", stars, "stated/camera.toml", "-o", "x", "--pixel-um", 5)
-    assert status == 2
-    assert err.startswith("error: --pixel-um is 5, but the pixel pitch is stated as 6.9 um")
-    status, _, err = cli("calibrate", stars, "camera.toml", "-o", "x", "--start", "focal_mm=35")
-    assert status == 2
-    assert "add --pixel-um UM, or give focal_px" in err
-    assert cli("calibrate", stars, "camera.toml", "-o", "y", "--start", "focal_px=5100")[0] == 0
+    said = "error: --pixel-um is 5, but the pixel pitch is stated as 6.9 um"
+    cli.refuses(said, f"calibrate {stars} stated/camera.toml -o x --pixel-um 5")
+    cli.refuses("add --pixel-um UM, or give focal_px", f"{call} -o x --start focal_mm=35")
+    cli.ok(f"{call} -o y --start focal_px=5100")
 
 
 def test_a_camera_without_a_pitch_keeps_its_pixels(tmp_path):
@@ -143,15 +128,11 @@ def test_a_camera_without_a_pitch_keeps_its_pixels(tmp_path):
     # With a pitch, the focal length in millimetres is what stays where the pitch changes.
     assert stated.replace(pixel_um=2.0 * PITCH).focal_px == pytest.approx(2557.0)
     assert unknown.with_theta(unknown.theta) == unknown
-    with pytest.raises(
-        CameraError, match="the pixel pitch is unknown: give pixel_um as well, or focal_px"
-    ):
+    with pytest.raises(CameraError):
         unknown.replace(focal_mm=35.0)
-    with pytest.raises(
-        CameraError, match="nothing is in millimetres, because the pixel pitch is unknown"
-    ):
+    with pytest.raises(CameraError):
         unknown.length_mm(1.0)
-    with pytest.raises(StudyError, match="needs the pitch of the camera"):
+    with pytest.raises(StudyError):
         camera_of(unknown, {"pixel_um": 5.0})
     finer = camera_of(unknown, {"pixels": 2048})
     assert finer.focal_px == pytest.approx(2.0 * unknown.focal_px)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import get_args
 
@@ -24,12 +25,11 @@ def breathed(tmp_path):
     obs = table(c)
     obs.select(np.abs(obs.xy - 511.5).max(axis=1) < 511.0).save(tmp_path / "obs.csv")
     sheet(c).save(tmp_path / "camera.toml")
-    return "obs.csv", "camera.toml"
+    return "obs.csv camera.toml"
 
 
 def test_the_terminal_shows_what_was_taken_up_and_what_was_not(cli, breathed) -> None:
-    status, out, err = cli("calibrate", *breathed, "-o", "run", "--effects", "auto", "--in-space")
-    assert status == 0, err
+    out, _ = cli.ok(f"calibrate {breathed} -o run --effects auto --in-space")
     effects = sc.Run("run").calibration.effects
     assert effects.names == ("frame",)
     row = next(line for line in out.splitlines() if line.startswith("│ frame "))
@@ -47,36 +47,29 @@ def test_the_terminal_shows_what_was_taken_up_and_what_was_not(cli, breathed) ->
 
 
 def test_a_document_holds_the_effects(cli, breathed) -> None:
-    words = ("calibrate", *breathed, "--json", "--effects")
-    _, out, _ = cli(*words, "frame", "-o", "a")
-    found = json.loads(out)["calibration"]["effects"]
+    found = cli.document(f"calibrate {breathed} --effects frame -o a")["calibration"]["effects"]
     assert [each["name"] for each in found["fitted"]] == ["frame"]
     assert not found["selected"] and found["refused"] == []
-    _, out, _ = cli(*words, "none", "-o", "b")
-    assert json.loads(out)["calibration"]["effects"] is None
+    found = cli.document(f"calibrate {breathed} --effects none -o b")["calibration"]["effects"]
+    assert found is None
 
 
 def test_nothing_taken_up_is_one_sentence(cli, tmp_path) -> None:
     c = campaign(np.random.default_rng(12), n_frames=10)
     table(c).save(tmp_path / "obs.csv")
     sheet(c).save(tmp_path / "camera.toml")
-    _, out, _ = cli("calibrate", "obs.csv", "camera.toml", "-o", "run", "--effects", "auto")
+    out, _ = cli.ok("calibrate obs.csv camera.toml -o run --effects auto")
     assert "The data support no effect beyond the camera. Not taken up (an effect has" in out
     assert "moved most" not in out
 
 
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
+def test_a_wrong_name_is_one_sentence(cli, breathed) -> None:
+    for given, sentence in (
         ("fild", "effect 'fild' is unknown: use none alone, or some of auto, axes, field,"),
         ("none,field", "effect 'none' is unknown: use none alone, or some of auto, axes"),
         ("temperature", "the effect 'temperature' needs what does not vary in this table"),
-    ],
-)
-def test_a_wrong_name_is_one_sentence(cli, breathed, given, sentence) -> None:
-    status, _, err = cli("calibrate", *breathed, "-o", "run", "--effects", given)
-    assert status == 2
-    assert sentence in err.splitlines()[-1]
+    ):
+        cli.refuses(sentence, f"calibrate {breathed} -o run --effects {given}")
 
 
 def test_every_effect_has_a_meaning_in_words() -> None:
@@ -91,11 +84,10 @@ def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp
     obs = table(c)
     obs.select(np.abs(obs.xy - 511.5).max(axis=1) < 511.0).save(tmp_path / "obs.csv")
     sheet(c).save(tmp_path / "camera.toml")
-    small = ("--ensembles", "2", "--walkers", "16", "--steps", "100", "--draws", "50")
-    words = ("run", "obs.csv", "camera.toml", "-o", "run", "--in-space", *small)
-    status, _, _ = cli(*words, "--effects", "none")
+    small = "--ensembles 2 --walkers 16 --steps 100 --draws 50"
+    cli.ok(f"run obs.csv camera.toml -o run --in-space {small} --effects none", among=(1,))
     run = sc.Run("run")
-    assert status == 1 and run.diagnosis.effects == ("frame",)
+    assert run.diagnosis.effects == ("frame",)
     verdict = json.loads(Path("run/verdict.json").read_text("utf-8"))
     structure = next(c for c in verdict["checks"] if c["name"] == "Unexplained structure")
     assert "would take up the effect frame." in structure["sentence"]
@@ -111,28 +103,31 @@ def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp
     assert command not in verdict["commands"]
 
 
-@pytest.fixture
-def warmed(cli, tmp_path):
+@pytest.fixture(scope="module")
+def calibrated_warm(tmp_path_factory):
     """A run whose calibration follows the temperature, and a profile of an orbit beside it."""
+    folder = tmp_path_factory.mktemp("warm")
     rng = np.random.default_rng(8)
     warmth = rng.uniform(-1.0, 1.0, 12)
     c = campaign(rng, n_frames=12, displaced=moving(0.5, warmth))
     obs = table(c, temperature_c=-25.0 + 15.0 * warmth[c.columns["frame"]])
-    obs.save(tmp_path / "obs.csv")
-    sheet(c).save(tmp_path / "camera.toml")
-    words = ("obs.csv", "camera.toml", "--effects", "temperature", "-o", "run")
-    assert cli("calibrate", *words)[0] == 0
-    run = sc.Run(tmp_path / "run")
+    obs.save(folder / "obs.csv")
+    sheet(c).save(folder / "camera.toml")
+    run = sc.Run(folder / "run")
+    run.calibrate(obs, sheet(c), effects="temperature")
     run.sample(seed=0, n_ensembles=2, n_walkers=16, n_steps=20)
-    (tmp_path / "orbit.csv").write_text("time_s,temperature_c\n0,-40\n60,-10\n90,5\n", "utf-8")
-    return tmp_path
+    (folder / "orbit.csv").write_text("time_s,temperature_c\n0,-40\n60,-10\n90,5\n", "utf-8")
+    return folder
+
+
+@pytest.fixture
+def warmed(calibrated_warm, tmp_path):
+    shutil.copytree(calibrated_warm, tmp_path, dirs_exist_ok=True)
 
 
 def test_a_temperature_profile_goes_from_the_command_line_into_the_budget(cli, warmed) -> None:
-    words = ("propagate", "run", "--draws", 50)
-    status, out, err = cli(*words, "--temperature-profile", "orbit.csv", "--json")
-    assert status == 0, err
-    attitude = json.loads(out)["attitude"]
+    words = "propagate run --draws 50"
+    attitude = cli.document(f"{words} --temperature-profile orbit.csv")["attitude"]
     assert attitude["onboard"] == "model"
     parts = {row["part"] for row in attitude["aboard"]}
     assert {"rest", "temperature, rest", "camera parameters, rest"} <= parts
@@ -147,15 +142,12 @@ def test_a_temperature_profile_goes_from_the_command_line_into_the_budget(cli, w
     assert "of the time outside of those of the calibration" in row.conditions
     # Another profile may be given to the budget alone.
     Path("mild.csv").write_text("time_s,temperature_c\n0,-26\n60,-24\n", "utf-8")
-    status, out, err = cli(
-        *("budget", "run", "--temperature-profile", "mild.csv", "--force", "--json")
-    )
-    assert status == 0, err
-    rows = json.loads(out)["budget"]["contributors"]
+    document = cli.document("budget run --temperature-profile mild.csv --force")
+    rows = document["budget"]["contributors"]
     mild = next(each for each in rows if each["name"] == row.name)
     assert mild["sigma_arcsec"] < 0.2 * row.sigma_arcsec
     # Without a profile the folder holds none, and the row is that of the calibration's range.
-    assert cli(*words, "--force")[0] == 0
+    cli.ok(f"{words} --force")
     assert not Path("run/thermal.csv").exists()
     plain = next(each for each in sc.Run("run").budget().rows if each.name == row.name)
     assert "orbit.csv" not in plain.conditions
@@ -178,6 +170,4 @@ def test_a_profile_that_cannot_act_is_one_sentence(cli, warmed) -> None:
         ),
         ("budget plain --temperature-profile orbit.csv", "holds no effect 'temperature', so that"),
     ):
-        status, _, err = cli(*words.split())
-        assert status == 2
-        assert sentence in err.splitlines()[-1]
+        cli.refuses(sentence, words)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 STUDY = """\
@@ -26,46 +25,33 @@ def test_a_study_from_its_file_to_its_page_and_on(
     # Figures have tests of their own.
     monkeypatch.setattr("starcal_uq.presentation.pages.studies.study_figures", lambda _study: {})
     (tmp_path / "my.toml").write_text(STUDY, "utf-8")
-    status, printed, _ = painting_cli("study", "my.toml", "-o", "out", "--json", "--workers", 0)
-    found = json.loads(printed)["study"]
-    assert status == 0
-    assert (found["n_cells"], found["n_ok"], found["complete"], found["problems"]) == (
-        2,
-        2,
-        True,
-        {},
-    )
+    found = painting_cli.document("study my.toml -o out --workers 0")["study"]
+    assert (found["n_cells"], found["n_ok"], found["problems"]) == (2, 2, {})
+    assert found["complete"]
     assert found["answer"] and found["advice"]
-    assert {path.name for path in (tmp_path / "out").iterdir()} >= {
-        "cells",
-        "study.nc",
-        "study.parquet",
-        "study.toml",
-    }
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names >= {"cells", "study.nc", "study.parquet", "study.toml"}
     assert (tmp_path / "out" / "study.toml").read_text("utf-8") == STUDY
     assert Path(found["page"]).name == "report.html"
 
 
 def test_cells_without_numbers_alone_are_status_1(painting_cli, tmp_path: Path) -> None:
     (tmp_path / "my.toml").write_text(STUDY + "fov_deg = [0.5]\n", "utf-8")
-    status, _, said = painting_cli("study", "my.toml", "-o", "out")
-    assert status == 1
+    _, said = painting_cli.ok("study my.toml -o out", among=(1,))
     assert "2 of 2 cells: only 0 of" in said
 
 
 def test_templates_and_errors(painting_cli, tmp_path: Path) -> None:
-    assert painting_cli("new", "study", "--template", "frames-stars")[0] == 0
-    assert painting_cli("new", "camera", "--template", "frames-stars")[0] == 2
+    painting_cli.ok("new study --template frames-stars")
+    painting_cli.refuses("", "new camera --template frames-stars")
     (tmp_path / "study.toml").rename(tmp_path / "new.toml")
     (tmp_path / "bad.toml").write_text(STUDY.replace("frames", "frame"), "utf-8")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
-    for arguments, words in (
-        ((), "STUDY 'study.toml': does not exist; check the path, or starcal-uq new study"),
-        (("bad.toml",), "bad.toml, section [sweep]: key frame is unknown; did you mean frames?"),
-        (("new.toml", "-o", "other"), "other: the folder exists and is not empty"),
+    for words, sentence in (
+        ("", "STUDY 'study.toml': does not exist; check the path, or starcal-uq new study"),
+        ("bad.toml", "bad.toml, section [sweep]: key frame is unknown; did you mean frames?"),
+        ("new.toml -o other", "other: the folder exists and is not empty"),
     ):
-        status, _, said = painting_cli("study", *arguments)
-        assert status == 2
-        assert said.startswith("error: ") and words in said and len(said.splitlines()) == 1
+        assert len(painting_cli.refuses(sentence, f"study {words}").splitlines()) == 1
     assert list((tmp_path / "other").iterdir()) == [tmp_path / "other" / "thesis.tex"]
