@@ -104,7 +104,7 @@ def test_a_run_becomes_a_notebook_of_its_own(
     )
     assert sum("image/png" in output.data for output in outputs) == 5
     assert run.verdict.headline in outputs[0].data["text/plain"]
-    with pytest.raises(RunFolderError, match=r"report\.ipynb: the file exists already"):
+    with pytest.raises(RunFolderError):
         run.notebook()
     run.sample(n_steps=20, seed=2, force=True)
     assert not path.exists(), "it is of a posterior that is gone"

@@ -219,5 +219,5 @@ def test_every_kind_has_its_times() -> None:
         *("APE", "AKE", "MPE 9 s", "MKE 9 s", "RPE 9 s", "RKE 9 s"),
         *(f"{kind} 9 s / 3 s" for kind in ("PDE", "KDE", "PRE", "KRE")),
     }
-    with pytest.raises(BudgetError, match="is unknown"):
+    with pytest.raises(BudgetError):
         Index("XPE")

@@ -95,7 +95,7 @@ def test_a_sensor_at_rest_and_new_fills_no_row() -> None:
 def test_frames_without_magnitudes_are_refused() -> None:
     from dataclasses import replace
 
-    with pytest.raises(BudgetError, match="give a column mag"):
+    with pytest.raises(BudgetError):
         sensor_rows(WORN, SHEET, replace(frames(), mag=None))
 
 
@@ -105,7 +105,7 @@ def test_a_budget_file_names_its_sensor(tmp_path: Path) -> None:
     path.write_text('[budget]\nsensor = "sensor.toml"\nrate_deg_s = 1.0\n')
     obs = observations()
     cal = sc.calibrate(obs, sc.paper.paper_start())
-    post = sc.sample(obs, cal, n_steps=60, seed=1)
+    post = sc.sample(obs, cal, n_steps=20, n_ensembles=2, seed=1)
     attitude = sc.propagate(post, obs, n_draws=50)
     made = sc.budget(post, obs, attitude, file=path, n_samples=10_000)
     found = {(row.name, row.axis): row for row in made.rows}

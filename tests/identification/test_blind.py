@@ -179,7 +179,7 @@ def test_what_files_say_of_the_lens(esa: Centroids) -> None:
     assert told
     assert sheet.focal_mm == pytest.approx(35.0)
     assert not sheet_of(esa)[1]
-    with pytest.raises(IdentificationError, match="do not say the size"):
+    with pytest.raises(IdentificationError):
         sheet_of(esa.with_meta(optics={}))
 
 

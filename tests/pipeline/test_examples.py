@@ -21,7 +21,7 @@ def test_the_example_is_whole_and_says_whose_it_is() -> None:
     assert esa.observations.meta["directions"] == "catalogue"
     for words in (esa.notice, esa.observations.meta["licence"], esa.text):
         assert "CC BY-SA 3.0 IGO" in words
-    with pytest.raises(SettingError, match="use one of esa"):
+    with pytest.raises(SettingError):
         sc.example_data("nobody's")  # type: ignore[arg-type]
 
 

@@ -91,7 +91,8 @@ def test_errors_of_attitude_are_those_of_propagation(sky, calibrated) -> None:
     cal, obs, _ = calibrated[0]
     # Three coefficients say little of the scale of temperature, on which the rest depends.
     found = forecast(sky, PlannedEffects({name: cal.effects.scale(name) for name in SCALES}))
-    error = sc.propagate(sc.sample(obs, cal, seed=1), obs, onboard="effects", n_draws=50)
+    post = sc.sample(obs, cal, seed=1, n_ensembles=2, n_steps=100)
+    error = sc.propagate(post, obs, onboard="effects", n_draws=50)
     expected = [found[f"rest_{axis}_arcsec"] for axis in ("pitch", "yaw", "roll")]
     np.testing.assert_allclose(error.analytic_rest_arcsec, expected, rtol=0.1)
     common = [found[f"common_{axis}_arcsec"] for axis in ("pitch", "yaw")]

@@ -127,7 +127,7 @@ def test_a_key_of_the_title_block_that_is_unknown_is_refused(tmp_path):
 def test_without_a_browser_nothing_is_written(found, monkeypatch, tmp_path):
     monkeypatch.setattr(printing, "browsers", lambda: iter(()))
     monkeypatch.setitem(sys.modules, "weasyprint", None)
-    with pytest.raises(sc.errors.MissingExtraError, match="a PDF takes a browser"):
+    with pytest.raises(sc.errors.MissingExtraError):
         sc.report(found, tmp_path / "sheet.pdf")
     assert not (tmp_path / "sheet.pdf").exists()
 

@@ -157,5 +157,5 @@ def test_pages_are_written_by_one_function(results: dict[type, Any], tmp_path: A
     for cls, ending in ((Plan, ""), (CameraComparison, ""), (Budget, ".html")):
         page = write_page(results[cls], tmp_path / f"{cls.__name__}{ending}")
         assert "</html>" in page.read_text(encoding="utf-8")
-    with pytest.raises(TypeError, match="no page for a SimpleNamespace"):
+    with pytest.raises(TypeError, match="no page for"):
         write_page(SimpleNamespace(), tmp_path)  # type: ignore[arg-type]

@@ -178,9 +178,9 @@ def test_a_budget_makes_what_rests_on_it_older_and_takes_nothing_away(tmp_path):
 def test_a_file_is_no_run_folder(tmp_path):
     path = tmp_path / "run"
     path.write_text("", encoding="utf-8")
-    with pytest.raises(RunFolderError, match="not a run folder but a file"):
+    with pytest.raises(RunFolderError):
         RunFolder(path).require("calibration")
-    with pytest.raises(RunFolderError, match="is a file, not a folder"):
+    with pytest.raises(RunFolderError):
         RunFolder(path).create()
 
 

@@ -87,7 +87,7 @@ def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
 
 def test_steps_give_what_they_write_and_remove_what_is_stale(tmp_path: Path) -> None:
     run = sc.Run(tmp_path / "run")
-    with pytest.raises(sc.errors.RunFolderError, match="starcal-uq calibrate"):
+    with pytest.raises(sc.errors.RunFolderError):
         _ = run.calibration
     obs = observations(n_frames=60)
     cal = run.calibrate(obs, sc.paper.paper_start())
@@ -108,7 +108,7 @@ def test_steps_give_what_they_write_and_remove_what_is_stale(tmp_path: Path) -> 
     run.calibrate(obs, sc.paper.paper_start(), force=True)
     assert [part.remedy.action for part in run.missing] == ["sample", "propagate", "diagnose"]
     assert run.best is run.calibration
-    with pytest.raises(sc.errors.RunFolderError, match=r"has no budget\.csv"):
+    with pytest.raises(sc.errors.RunFolderError):
         _ = run.error_budget
 
 
@@ -136,14 +136,9 @@ def test_data_of_another_calibration_are_refused_with_one_sentence(
 ) -> None:
     sc.Run(tmp_path).calibrate(observations(), sc.paper.paper_start())
     observations(seed=4).save(tmp_path / "observations.parquet", force=True)
-    with pytest.raises(
-        sc.errors.RunFolderError, match=r"not the file that this run .* run `starcal-uq calibrate"
-    ):
+    with pytest.raises(sc.errors.RunFolderError, match="not the file that this run"):
         getattr(sc.Run(tmp_path), step)()
     # A folder of a version without records.
     (tmp_path / "run.json").unlink()
-    with pytest.raises(
-        sc.errors.RunFolderError,
-        match=r"made from other observations .* run `starcal-uq calibrate`",
-    ):
+    with pytest.raises(sc.errors.RunFolderError, match="made from other observations"):
         getattr(sc.Run(tmp_path), step)()

@@ -99,7 +99,7 @@ def test_an_information_that_is_not_positive_definite_is_refused_when_it_is_read
     path.write_text(json.dumps(open_one | {"information": weak.tolist()}))
     assert Calibration.load(path).undetermined
     path.write_text(json.dumps(open_one | {"information": (-information).tolist()}))
-    with pytest.raises(RunFolderError, match="not positive definite"):
+    with pytest.raises(RunFolderError):
         Calibration.load(path)
 
 

@@ -76,18 +76,15 @@ def test_the_command_writes_everything_and_the_call_has_its_numbers(few, cli, ca
     assert made.calibration.effects.names == typed.calibration.effects.names
     assert made.verdict.headline == typed.verdict.headline
     # Draws of another seed differ.
-    made.sample(n_steps=20, n_ensembles=2, seed=4, force=True)
-    assert not np.array_equal(made.posterior.draws, typed.posterior.draws)
-
-
-def test_a_run_is_shown_by_its_verdict_and_kept_as_long_as_it_is_asked_for(few, tmp_path, cli):
-    run = sc.run(few, sc.paper.paper_start(), effects="none", **FEW)
-    for shown in (repr(run), run._repr_html_()):
-        assert run.verdict.headline in shown and "Across the boresight" in shown
-    assert repr(run).startswith(run.verdict.headline)
-    place = run.path
-    assert run.has("budget") and not run.has("report")
-    del run
+    draws = sc.sample(made.observations, made.calibration, n_steps=20, n_ensembles=2, seed=4).draws
+    assert not np.array_equal(draws, typed.posterior.draws)
+    # A call without a folder is shown by its verdict, and its files are there as long as it is.
+    for shown in (repr(made), made._repr_html_()):
+        assert made.verdict.headline in shown and "Across the boresight" in shown
+    assert repr(made).startswith(made.verdict.headline)
+    place = made.path
+    assert made.has("budget") and not made.has("report")
+    del made
     gc.collect()
     assert not place.parent.exists()
 
@@ -109,7 +106,7 @@ def test_a_run_in_a_folder_has_a_report_and_the_command_that_repeats_it(few, tmp
     draws = run.posterior.draws
     assert cli(*run.place.words, "-o", "again") in (0, 1)
     assert np.array_equal(draws, sc.Run("again").posterior.draws)
-    with pytest.raises(sc.StarcalError, match="force"):
+    with pytest.raises(sc.StarcalError):
         sc.run(*files, out="run", **FEW)
 
 
@@ -131,7 +128,9 @@ def test_settings_that_make_no_sense_are_refused_in_one_sentence(few, settings, 
     assert "\n" not in str(refused.value)
 
 
-def test_a_call_that_fails_names_a_call_and_that_call_works():
+def test_a_call_that_fails_names_a_call_and_that_call_works(monkeypatch):
+    # What follows the calibration is not asked about.
+    monkeypatch.setattr("starcal_uq.runs.whole.finish", lambda *_, **__: None)
     # The command line cannot name stars that are in memory alone.
     seen = campaign(np.random.default_rng(3), n_frames=20, stars_per_frame=15)
     stars, wrong = pd.DataFrame(seen.columns), slice(0, 300, 20)

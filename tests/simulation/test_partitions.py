@@ -77,7 +77,7 @@ def test_interrupted_simulation_goes_on(sky, tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         simulate_partitions(stars, camera, tmp_path, progress=stop, **options)
-    with pytest.raises(ObservationError, match=r"holds no \.parquet file"):
+    with pytest.raises(ObservationError):
         sc.observations.open_partitions(tmp_path)
     kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / UNFINISHED).iterdir()}
     assert len(kept) == 2

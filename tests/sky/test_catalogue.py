@@ -285,9 +285,9 @@ def test_observer_velocity_makes_directions_apparent(stars: StarCatalogue) -> No
     assert np.allclose(
         separation_arcsec(stars.directions_icrs, seen.directions_icrs), expected, rtol=0, atol=2e-3
     )
-    with pytest.raises(CatalogueError, match="apparent already"):
+    with pytest.raises(CatalogueError):
         seen.seen_from(velocity)
-    with pytest.raises(CatalogueError, match="before aberration"):
+    with pytest.raises(CatalogueError):
         seen.at_epoch(2020.0)
 
 

