@@ -307,6 +307,7 @@ def test_the_gallery_has_every_figure(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unpainted")
 def test_every_figure_is_drawn_into_that_of_the_user(monkeypatch, tmp_path):
     """Those of the paper's field experiment, which takes minutes, alone are left out."""
     from matplotlib import pyplot
