@@ -41,6 +41,7 @@ from starcal_uq.identification.pyramid import (
     CameraTolerance,
     FieldGeometry,
     Hypothesis,
+    axes_along,
     axes_of,
     unit_directions,
 )
@@ -117,8 +118,13 @@ def quads_of(neighbours: IntArray) -> IntArray:
     keys = (quads[:, 0] * n + quads[:, 1], quads[:, 2] * n + quads[:, 3])
     order = np.lexsort(keys)
     new = np.ones(len(quads), dtype=np.bool_)
-    new[1:] = np.any(np.diff(np.column_stack(keys)[order], axis=0) != 0, axis=1)
+    one, two = (key[order] for key in keys)
+    new[1:] = (one[1:] != one[:-1]) | (two[1:] != two[:-1])
     return quads[order[new]]
+
+
+# Of four points, the ends of each side and the other two.
+_ENDS = np.array([[0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3], [2, 1, 1, 0, 0, 0], [3, 3, 2, 3, 2, 1]])
 
 
 def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -129,24 +135,22 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     the complex numbers: the code is c and d, with a the end that they are nearer to, and c before
     d.
     """
-    v = directions[quads]
-    frame = axes_of(v, 0, 1)
-    p = np.einsum("qki,qai->qak", v, frame)
-    p = (p[:, 0] + 1j * p[:, 1]) / p[:, 2]
-    pairs = np.array(list(combinations(range(4), 2)))
-    longest = np.argmax(np.abs(p[:, pairs[:, 0]] - p[:, pairs[:, 1]]), axis=1)
-    rows = np.arange(len(quads))[:, None]
-    order = np.hstack([pairs[longest], pairs[::-1][longest]])
-    p = p[rows, order]
-    c = (p[:, 2:] - p[:, :1]) / (p[:, 1:2] - p[:, :1])
-    turn = c.real.sum(axis=1) > 1.0
-    c[turn] = 1.0 - c[turn]
-    order[turn, :2] = order[turn, 1::-1]
-    swap = c[:, 0].real > c[:, 1].real
-    c[swap] = c[swap, ::-1]
-    order[swap, 2:] = order[swap, :1:-1]
-    quads = quads[rows, order]
-    codes = np.ascontiguousarray(c).view(np.float64)
+    # Patterns along the last axis, so that NumPy's inner loops run over them.
+    v = directions.T[:, quads.T]
+    p = np.einsum("ikq,aiq->akq", v, axes_along(v, 0, 1))
+    p = (p[0] + 1j * p[1]) / p[2]
+    apart = p[_ENDS[0]] - p[_ENDS[1]]
+    order = _ENDS[:, np.argmax(apart.real**2 + apart.imag**2, axis=0)]
+    p = np.take_along_axis(p, order, axis=0)
+    c = (p[2:] - p[0]) / (p[1] - p[0])
+    turn = c.real.sum(axis=0) > 1.0
+    c = np.where(turn, 1.0 - c, c)
+    order[:2] = np.where(turn, order[1::-1], order[:2])
+    swap = c[0].real > c[1].real
+    c = np.where(swap, c[::-1], c)
+    order[2:] = np.where(swap, order[:1:-1], order[2:])
+    quads = np.take_along_axis(quads, order.T, axis=1)
+    codes = np.ascontiguousarray(c.T).view(np.float64)
     return codes, quads, angle_between(directions[quads[:, 0]], directions[quads[:, 1]])
 
 
@@ -255,17 +259,18 @@ class Levels:
     """
 
     def __init__(self, stars: StarCatalogue, folder: PathLike | None) -> None:
-        order = np.argsort(stars.mag, kind="stable")
-        self._directions = np.ascontiguousarray(stars.directions_icrs[order[: LEVELS[-1]]])
-        self._folder = folder
+        self._stars, self._folder = stars, folder
 
     def __getitem__(self, n: int) -> Level:
-        bright = self._directions[:n]
-        key = digest_of((bright,), _VERSION, _CELL, _nearest(len(bright)))
+        return remembered(_made, _KEPT_LEVELS, self._stars.digest(n), partial(self._make, n))
+
+    def _make(self, n: int) -> Level:
+        bright = self._stars.brightest_first[1][:n]
         make = partial(make_level, bright)
-        if self._folder is not None:
-            make = partial(cached, Level, f"star-patterns-{key}", make, self._folder)
-        return remembered(_made, _KEPT_LEVELS, key, make)
+        if self._folder is None:
+            return make()
+        key = digest_of((bright,), _VERSION, _CELL, _nearest(len(bright)))
+        return cached(Level, f"star-patterns-{key}", make, self._folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +316,7 @@ class BlindSearch:
         self.tolerance = CameraTolerance(
             _FOCAL, _CENTRE * self.width, max(1.0, _DISTORTION * corner)
         )
-        self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
+        self.sky = NearbyStars(stars, self.geometry)
 
     def sizes(self, most: int, focal_px: tuple[float, float]) -> list[int]:
         """Levels with at most this number of stars, of which a field shows enough."""

@@ -34,7 +34,7 @@ from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.outcome import identification, moved
 from starcal_uq.identification.pairs import default_cache_dir
-from starcal_uq.identification.proposers import Proposer, prepare_engine
+from starcal_uq.identification.proposers import Proposer, offered_engine, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.result import (
     FoundOptics,
@@ -192,6 +192,7 @@ def identify(
     tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     if calibration is not None:
         sheet, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
+    offered_engine(engine)
     prepare = partial(prepare_engine, engine, cache=cache, cache_dir=cache_dir)
     folder = (cache_dir or default_cache_dir()) if cache else None
     attempt = _Attempt(centroids, catalogue, sheet, tolerance, prepare, share_camera)
@@ -260,8 +261,9 @@ class _Attempt:
     def search(self) -> Search:
         """The catalogue prepared for the camera, when it is first needed."""
         if self._search is None:
-            proposer = self.prepare(self.stars, field_geometry(self.field.camera), self.tolerance)
-            self._search = Search(self.field.camera, self.stars, self.tolerance, proposer)
+            geometry = field_geometry(self.field.camera)
+            prepare = partial(self.prepare, self.stars, geometry, self.tolerance)
+            self._search = Search(self.field.camera, self.stars, self.tolerance, prepare)
         return self._search
 
     @property
@@ -280,9 +282,7 @@ class _Attempt:
 
     def grown(self, k: int, patch: Patch) -> GrownField | None:
         """What a frame shows of the lens around its matched stars, where that is beyond doubt."""
-        sky = NearbyStars(
-            self.stars.directions_icrs, self.stars.mag, field_geometry(self.field.camera)
-        )
+        sky = NearbyStars(self.stars, field_geometry(self.field.camera))
         found = grow(self.field.xy[k], self.field.sigma[k], patch, sky, self.field.camera)
         return found if found is not None and found.log10_false < _SURE else None
 

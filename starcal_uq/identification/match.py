@@ -364,11 +364,13 @@ def _mutual(
     `tree` is that of the centroids (n, 2), of which only those nearest to a star are looked at
     further.
     """
-    u, farthest = tree.data, float(limit_px.max()) * (1.0 + 1e-9)
+    u, farthest = tree.data, float(limit_px.max())
+    if distinct_px2 is not None:
+        # A star that is not the nearest one of any centroid may make another ambiguous.
+        farthest = float(np.sqrt(farthest**2 + distinct_px2.max()))
+    farthest *= 1.0 + 1e-9
     nearest_centroid = tree.query(predicted, distance_upper_bound=farthest)[1]
-    # A star without a centroid near it is not the nearest one of any, but may make another
-    # ambiguous.
-    near = np.flatnonzero((nearest_centroid < len(u)) | (distinct_px2 is not None))
+    near = np.flatnonzero(nearest_centroid < len(u))
     predicted, nearest_centroid = predicted[near], nearest_centroid[near]
     rows = np.unique(nearest_centroid[nearest_centroid < len(u)])
     if not len(rows):

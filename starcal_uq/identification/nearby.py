@@ -10,6 +10,7 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.identification.pyramid import FieldGeometry
+from starcal_uq.sky.catalogue import StarCatalogue
 
 # Centroids are compared with the catalogue down to where a field holds this many stars for each,
 # and some more.
@@ -20,14 +21,10 @@ _FEW, _LOOKS = 20_000, 300
 
 
 class NearbyStars:
-    """A catalogue, unit vectors (N, 3) and magnitudes (N,), searched to the depth that suits a
-    frame.
-    """
+    """A catalogue, searched to the depth that suits a frame."""
 
-    def __init__(self, directions: FloatArray, mag: FloatArray, geometry: FieldGeometry) -> None:
-        self.rows: IntArray = np.argsort(mag, kind="stable").astype(np.int64)
-        self.directions = np.ascontiguousarray(directions[self.rows])
-        self.mag = mag[self.rows]
+    def __init__(self, stars: StarCatalogue, geometry: FieldGeometry) -> None:
+        self.rows, self.directions, self.mag = stars.brightest_first
         self.geometry = geometry
         self._trees: dict[int, Any] = {}
         self._looks: dict[int, int] = {}

@@ -13,6 +13,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from pathlib import Path
@@ -28,6 +29,8 @@ from starcal_uq.core.types import FloatArray, IntArray, PathLike
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+    from starcal_uq.sky.catalogue import StarCatalogue
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -205,12 +208,11 @@ def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
 
 # What was prepared last, for cameras that are used in turns; the key says for what.
 _RECENT = 4
-_recent: dict[str, StarPairs] = {}
+_recent: dict[tuple[str, float, float], StarPairs] = {}
 
 
 def prepared_star_pairs(
-    directions: FloatArray,
-    mag: FloatArray,
+    stars: StarCatalogue,
     field_sr: float,
     max_angle_rad: float,
     cache: bool,
@@ -219,9 +221,10 @@ def prepared_star_pairs(
     """The pairs that this process has used before, or else those of the file where `cache` is on,
     or new ones.
     """
-    given = directions, mag, field_sr, max_angle_rad
+    given = stars.directions_icrs, stars.mag, field_sr, max_angle_rad
     make = partial(cached_star_pairs, cache_dir=cache_dir) if cache else find_star_pairs
-    return remembered(_recent, _RECENT, _pairs_digest(*given), partial(make, *given))
+    key = stars.digest(len(stars)), field_sr, max_angle_rad
+    return remembered(_recent, _RECENT, key, partial(make, *given))
 
 
 def remembered(kept: dict[K, V], most: int, key: K, make: Callable[[], V]) -> V:
@@ -233,12 +236,6 @@ def remembered(kept: dict[K, V], most: int, key: K, make: Callable[[], V]) -> V:
             del kept[next(iter(kept))]
     kept[key] = found
     return found
-
-
-def _pairs_digest(
-    directions: FloatArray, mag: FloatArray, field_sr: float, max_angle_rad: float
-) -> str:
-    return digest_of((directions, mag), _VERSION, field_sr, max_angle_rad, PATTERN_STARS)
 
 
 def digest_of(arrays: Iterable[FloatArray], *parameters: Any) -> str:
@@ -258,8 +255,8 @@ def cached_star_pairs(
 ) -> StarPairs:
     """`find_star_pairs`, `cached` in the folder."""
     given = directions, mag, field_sr, max_angle_rad
-    name = f"star-pairs-{_pairs_digest(*given)}"
-    return cached(StarPairs, name, partial(find_star_pairs, *given), cache_dir)
+    key = digest_of((directions, mag), _VERSION, field_sr, max_angle_rad, PATTERN_STARS)
+    return cached(StarPairs, f"star-pairs-{key}", partial(find_star_pairs, *given), cache_dir)
 
 
 class Fitting(Protocol):
@@ -286,13 +283,11 @@ def cached(kind: type[F], name: str, make: Callable[[], F], cache_dir: PathLike 
     if stored is not None:
         return stored
     made = make()
-    try:
+    # The cache only saves time: without it everything works.
+    with suppress(OSError, RunFolderError):
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             np.savez(temporary, **{name: getattr(made, name) for name in _names(kind)})
-    except (OSError, RunFolderError):
-        # The cache only saves time: without it everything works.
-        return made
     return made
 
 

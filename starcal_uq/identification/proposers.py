@@ -81,6 +81,4 @@ def prepare_pairs(
     # Rounded, so that cameras of nearly the same field share a file.
     largest = float(np.ceil(largest * 200.0) / 200.0)
     field_sr = float(f"{w * h / f**2:.2g}")
-    return prepared_star_pairs(
-        stars.directions_icrs, stars.mag, field_sr, largest, cache, cache_dir
-    )
+    return prepared_star_pairs(stars, field_sr, largest, cache, cache_dir)

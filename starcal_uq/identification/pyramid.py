@@ -293,21 +293,26 @@ def unit_directions(u: FloatArray, focal_px: FloatArray) -> FloatArray:
 
 def _triple(directions: FloatArray, triangles: IntArray) -> FloatArray:
     """Triple products (m,) of triangles (m, 3)."""
-    a, b, c = (directions[triangles[:, column]] for column in range(3))
-    return floats(np.einsum("mi,mi->m", a, _cross(b, c)))
+    a, b, c = (directions[triangles[:, column]].T for column in range(3))
+    return floats(np.einsum("im,im->m", a, _cross(b, c)))
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
+    return a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
+
+
+def axes_along(v: FloatArray, p: int, q: int) -> FloatArray:
+    """Orthonormal axes (3 axes, 3, m) of sets of directions (3, k, m): towards the middle, and along
+    the side from p to q.
+    """
+    z = v.sum(axis=1)
+    z = z / np.sqrt(np.einsum("im,im->m", z, z))
+    x = v[:, q] - v[:, p]
+    x = x - np.einsum("im,im->m", x, z) * z
+    x = x / np.sqrt(np.einsum("im,im->m", x, x))
+    return np.stack([x, _cross(z, x), z])
 
 
 def axes_of(v: FloatArray, p: int, q: int) -> FloatArray:
-    """Orthonormal axes (m, 3 axes, 3) of triangles (m, 3, 3): towards the middle, and along one
-    side.
-    """
-    z = v.sum(axis=1)
-    z = z / np.sqrt(np.einsum("mi,mi->m", z, z))[:, None]
-    x = v[:, q] - v[:, p]
-    x = x - np.einsum("mi,mi->m", x, z)[:, None] * z
-    x = x / np.sqrt(np.einsum("mi,mi->m", x, x))[:, None]
-    return np.stack([x, _cross(z, x), z], axis=1)
+    """`axes_along` as matrices (m, 3 axes, 3), of directions (m, k, 3)."""
+    return np.ascontiguousarray(axes_along(v.transpose(2, 1, 0), p, q).transpose(2, 0, 1))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cache
 from time import perf_counter
 from typing import TYPE_CHECKING, Protocol
 
@@ -136,21 +137,23 @@ class FrameTable:
 
 
 class Search:
-    """The catalogue prepared for one camera and its tolerances."""
+    """The catalogue prepared for one camera and its tolerances; `prepare` makes the proposer when
+    it is first needed.
+    """
 
     def __init__(
         self,
         camera: Camera,
         stars: StarCatalogue,
         tolerance: CameraTolerance,
-        proposer: Proposer,
+        prepare: Callable[[], Proposer],
     ) -> None:
         self.geometry = field_geometry(camera)
         self.tolerance, self.radial = tolerance, has_radial(camera)
         self.centroids: tuple[int, ...] = _CENTROIDS
         self.triangles = _MAX_TRIANGLES
-        self.proposer = proposer
-        self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
+        self.proposer = cache(prepare)
+        self.sky = NearbyStars(stars, self.geometry)
 
     def widened(self, factor: float) -> Search:
         """The same for a lens with more distortion."""
@@ -178,9 +181,11 @@ class Search:
 
     def frame(self, field: FrameTable, k: int) -> Found:
         """Identify one frame from nothing."""
-        clock = perf_counter()
         if len(field.points[k]) < MIN_STARS:
-            return Found("too few stars", None, perf_counter() - clock)
+            return Found("too few stars", None, 0.0)
+        # No frame waits for the catalogue.
+        self.proposer()
+        clock = perf_counter()
         status, match = self._look(field, k)
         return Found(status, match, perf_counter() - clock)
 
@@ -248,7 +253,9 @@ class Search:
         more.
         """
         points, sigma = field.points[k], field.sigma[k]
-        batches = self.proposer(points, sigma, self.geometry, self.tolerance, n_centroids, searched)
+        batches = self.proposer()(
+            points, sigma, self.geometry, self.tolerance, n_centroids, searched
+        )
         left = self.triangles
         for batch in batches:
             if left <= 0:

@@ -4,6 +4,7 @@ directions.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -101,6 +102,27 @@ class StarCatalogue(Shown):
         directions = unit_vectors(self.ra_deg, self.dec_deg)
         directions.setflags(write=False)
         return directions
+
+    @cached_property
+    def brightest_first(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Rows of the stars (n,), brightest first, with their directions (n, 3) and magnitudes
+        (n,).
+        """
+        rows = np.argsort(self.mag, kind="stable").astype(np.int64)
+        return rows, self.directions_icrs[rows], self.mag[rows]
+
+    def digest(self, n: int) -> str:
+        """Hash of the directions and magnitudes of the brightest n stars."""
+        if n not in self._digests:
+            found = hashlib.sha256()
+            for values in self.brightest_first[1:]:
+                found.update(values[:n].tobytes())
+            self._digests[n] = found.hexdigest()
+        return self._digests[n]
+
+    @cached_property
+    def _digests(self) -> dict[int, str]:
+        return {}
 
     def select(self, mask: BoolArray | IntArray) -> StarCatalogue:
         """The stars that a mask of shape (n,), or an array of indices, picks, in that order."""

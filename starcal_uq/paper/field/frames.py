@@ -224,7 +224,8 @@ class _IdentifyTask:
         field = FrameTable(self.frames.centroids, camera)
         # `identify` would try failed frames again with wider tolerances and refine the camera over
         # all frames.
-        search = Search(camera, self.stars, corner_tolerance(camera, tolerance_px), self.proposer)
+        tolerance = corner_tolerance(camera, tolerance_px)
+        search = Search(camera, self.stars, tolerance, lambda: self.proposer)
         n = len(field.ids)
         matches = [search.frame(field, k).match for k in range(n)]
         solved = [(k, match) for k, match in enumerate(matches) if match is not None]
