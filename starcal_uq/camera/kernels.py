@@ -17,7 +17,7 @@ import numpy as np
 from starcal_uq.core.types import AnyDict, FloatArray, floats
 
 # Stars are evaluated in blocks whose temporaries stay in the processor's second-level cache.
-BLOCK = 2048
+BLOCK = 6144
 
 _UNARY = {
     "OP_ASSIGN": "{0}",

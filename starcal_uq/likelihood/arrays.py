@@ -29,7 +29,7 @@ from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
 # Stars whose arrays stay in the second-level cache, and are enough to hide the interpreter.
-BLOCK_STARS, PAIR_STARS, _EXPANSION_STARS = 3072, 4096, 6144
+BLOCK_STARS, PAIR_STARS, _EXPANSION_STARS = 6144, 4096, 6144
 # Enough for the turn of all frames together.
 _FEW_STARS = 128
 
