@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from enum import Enum, auto
+from enum import Enum
 from functools import cached_property
 from operator import ge, gt, le, lt
 from typing import Any, ClassVar
@@ -136,59 +136,31 @@ class Code(Enum):
 CODES = {code.value[0]: code for code in Code}
 
 
-class Advice(Enum):
-    """What to do with the instrument or the data."""
-
-    FRAMES_THAT_HELP = auto()
-    ANOTHER_PRIOR = auto()
-    SAMPLE_WITH_OBSERVATIONS = auto()
-    LOOK_FOR_THE_CAUSE = auto()
-    MEND_THE_ESTIMATE = auto()
-    NEARER_START = auto()
-    ACCEPT_THE_FOCAL_LENGTH = auto()
-    FRAMES_APART = auto()
-    ACCEPT_THE_PHASE = auto()
-    LEAVE_OUT_MAGNITUDES = auto()
-    CHECK_THE_DIRECTIONS = auto()
-    WITHOUT_STAR_ERRORS = auto()
-    WITHOUT_ROTATIONS = auto()
-    COUNT_THE_PATTERN = auto()
-    STATE_THE_SITE = auto()
-    GIVE_THE_DIRECTIONS = auto()
-    CORRECT_THE_EPOCH = auto()
-    CORRECT_THE_TIMES = auto()
-    GIVE_MEASURED_CENTROIDS = auto()
-    STATE_NOISE_IN_PX = auto()
-    DIVIDE_THE_NOISE = auto()
-    ACCEPT_THE_FACTOR = auto()
-    LOOK_AT_THE_FILE = auto()
-    LET_THE_RULE_JUDGE = auto()
-    STATE_WHAT_IS_MISSING = auto()
-    REDUCE_OR_RELAX = auto()
+# What to do with the instrument or the data.
+Advice = Enum(
+    "Advice",
+    """
+    FRAMES_THAT_HELP ANOTHER_PRIOR SAMPLE_WITH_OBSERVATIONS LOOK_FOR_THE_CAUSE MEND_THE_ESTIMATE
+    NEARER_START ACCEPT_THE_FOCAL_LENGTH FRAMES_APART ACCEPT_THE_PHASE LEAVE_OUT_MAGNITUDES
+    CHECK_THE_DIRECTIONS WITHOUT_STAR_ERRORS WITHOUT_ROTATIONS COUNT_THE_PATTERN STATE_THE_SITE
+    GIVE_THE_DIRECTIONS CORRECT_THE_EPOCH CORRECT_THE_TIMES GIVE_MEASURED_CENTROIDS
+    STATE_NOISE_IN_PX DIVIDE_THE_NOISE ACCEPT_THE_FACTOR LOOK_AT_THE_FILE LET_THE_RULE_JUDGE
+    STATE_WHAT_IS_MISSING REDUCE_OR_RELAX
+    """,
+)
 
 
-class Note(Enum):
-    """What is worth telling beside checks."""
-
-    PAIRS_AS_INDEPENDENT = auto()
-    WRONG_TIMES = auto()
-    REFRACTION_IN_THE_RESIDUALS = auto()
-    REFRACTION_CORRECTED = auto()
-    CONDITIONAL_ON_REFRACTION = auto()
-    REFRACTION_ESTIMATED = auto()
-    LIKE_REFRACTION = auto()
-    WITHOUT_REFRACTION = auto()
-    APPARENT_DIRECTIONS = auto()
-    DIRECTIONS_WITHOUT_ABERRATION = auto()
-    RESTS_ON_ABERRATION = auto()
-    ABERRATION = auto()
-    ADDED_NOISE_TOO_LARGE = auto()
-    NOISE_IS_THE_MAGNITUDES = auto()
-    NOISE_LIKE_MAGNITUDES = auto()
-    NOISE_LIKE_ARCSECONDS = auto()
-    MODEL_IS_WRONG = auto()
-    HEADLINE = auto()
-    NOT_USABLE = auto()
+# What is worth telling beside checks.
+Note = Enum(
+    "Note",
+    """
+    PAIRS_AS_INDEPENDENT WRONG_TIMES REFRACTION_IN_THE_RESIDUALS REFRACTION_CORRECTED
+    CONDITIONAL_ON_REFRACTION REFRACTION_ESTIMATED LIKE_REFRACTION WITHOUT_REFRACTION
+    APPARENT_DIRECTIONS DIRECTIONS_WITHOUT_ABERRATION RESTS_ON_ABERRATION ABERRATION
+    ADDED_NOISE_TOO_LARGE NOISE_IS_THE_MAGNITUDES NOISE_LIKE_MAGNITUDES NOISE_LIKE_ARCSECONDS
+    MODEL_IS_WRONG HEADLINE NOT_USABLE
+    """,
+)
 
 
 @dataclass(frozen=True)

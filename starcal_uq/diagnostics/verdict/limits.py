@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum, auto
+from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,16 +23,13 @@ if TYPE_CHECKING:
 _STRONG = 0.7
 
 
-class Limit(Enum):
-    """What limits a result."""
-
-    PATTERN = auto()
-    DIRECTIONS = auto()
-    AIR = auto()
-    STRUCTURE = auto()
-    ATTITUDE = auto()
-    COUPLED = auto()
-    FRAMES = auto()
+# What limits a result.
+Limit = Enum(
+    "Limit",
+    """
+    PATTERN DIRECTIONS AIR STRUCTURE ATTITUDE COUPLED FRAMES
+    """,
+)
 
 
 def limits(

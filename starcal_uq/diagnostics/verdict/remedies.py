@@ -11,7 +11,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, auto
+from enum import Enum
 from typing import Any, get_args
 
 from starcal_uq.core.conflicts import (
@@ -72,14 +72,13 @@ _ENDS = {
 }
 
 
-class Refusal(Enum):
-    """Why a calibration is of no use to a run."""
-
-    TIMES_UNKNOWN = auto()
-    SITE_UNKNOWN = auto()
-    MADE_WITH = auto()
-    TRIED = auto()
-    EXCLUDED = auto()
+# Why a calibration is of no use to a run.
+Refusal = Enum(
+    "Refusal",
+    """
+    TIMES_UNKNOWN SITE_UNKNOWN MADE_WITH TRIED EXCLUDED
+    """,
+)
 
 
 @dataclass(frozen=True)
