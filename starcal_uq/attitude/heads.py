@@ -31,7 +31,7 @@ from starcal_uq.core.errors import HeadError, StarcalError, require
 from starcal_uq.core.toml import Key, Section, read_toml
 from starcal_uq.core.types import FloatArray, IntArray, PathLike
 from starcal_uq.maths.intervals import chi_square_both_sides
-from starcal_uq.maths.linear import mean_weights
+from starcal_uq.maths.linear import mean_weights, root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -218,7 +218,7 @@ class HeadArray:
         for kept in sorted(filter(any, sets), key=sum):
             _, fused = self.gains(np.where(np.array(kept)[:, None, None], covariance, np.nan))
             names = " + ".join(name for name, one in zip(self.names, kept, strict=True) if one)
-            rows.append((names, *(ARCSEC * np.sqrt(np.diag(fused)))))
+            rows.append((names, *(ARCSEC * root_diagonal(fused))))
         return pd.DataFrame(rows, columns=["heads", "x_arcsec", "y_arcsec", "z_arcsec"])
 
     def by_frame(

@@ -19,7 +19,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import HeadError, check_known, require
 from starcal_uq.core.types import FloatArray
-from starcal_uq.maths.linear import inverses
+from starcal_uq.maths.linear import inverses, root_diagonal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,7 +74,7 @@ class Misalignments:
 
     @property
     def _sigmas(self) -> list[FloatArray]:
-        return list(np.sqrt(np.diag(self.covariance)).reshape(-1, *self.correction_arcsec.shape))
+        return list(root_diagonal(self.covariance).reshape(-1, *self.correction_arcsec.shape))
 
     def corrected(self, temperature_c: float | None = None) -> HeadArray:
         """The heads with corrected mountings, at a temperature or at the mean of the frames."""

@@ -318,12 +318,8 @@ class Budget(Shown):
     def to_dict(self) -> AnyDict:
         """Plain values for JSON; unknown values are None, never zero or NaN."""
 
-        def plain(table: pd.DataFrame) -> list[AnyDict]:
-            records = table.to_dict("records")
-            return [
-                {key: None if _unknown(value) else value for key, value in record.items()}
-                for record in records
-            ]
+        def plain(table: pd.DataFrame) -> Any:
+            return to_plain(table.to_dict("records"), null=True)
 
         return {
             "title": self.title,
@@ -452,10 +448,6 @@ def _table(records: Sequence[Any], kind: Any) -> pd.DataFrame:
     names = [*(f.name for f in fields(kind)), *kind.DOCUMENTED]
     rows = [[getattr(record, name) for name in names] for record in records]
     return pd.DataFrame(rows, columns=names)
-
-
-def _unknown(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 def judge(

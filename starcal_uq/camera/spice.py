@@ -130,7 +130,7 @@ def _camera(instrument: int, words: Keywords) -> KernelCamera:
         if not name and default is None:
             raise ValueError(f"INS{instrument} lacks {names[-1]}")
         values = [v.upper().replace("D", "E") for v in words[name]] if name else default
-        found = floats(np.asarray(values, dtype=np.float64).ravel())
+        found = floats(values).ravel()
         if len(found) not in (1, count) or not np.all(np.isfinite(found)):
             raise ValueError(f"INS{instrument}_{name} has not {count} finite numbers")
         return np.resize(found, count)

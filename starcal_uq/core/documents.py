@@ -6,7 +6,6 @@ NaN and infinity are null: not known, not determined, or not assessed.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -135,7 +134,7 @@ def _fitted(kind: AnyDict, value: Any, find: Callable[[str], Part], name: str) -
     if kind["type"] == "object":
         inner = kind["additionalProperties"]
         if inner is True:
-            return json.loads(json.dumps(value, default=to_plain), parse_constant=lambda _: None)
+            return to_plain(value, null=True)
         return {str(each): _fitted(inner, item, find, name) for each, item in value.items()}
     value = value.value if isinstance(value, Enum) else value
     value = str(value) if isinstance(value, PathLike) else value

@@ -8,6 +8,7 @@ by `to_dict` and `from_dict`.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -55,8 +56,8 @@ def to_plain(
 
     `arrays` takes arrays under the names of their fields (``stages`` holds ``stage0_cost``,
     ``stage1_cost``...), or those of the fields `apart` alone, which are then left out of the
-    result; without it they become lists. `null` writes NaN as None, because strict JSON has no
-    other word for it; `from_plain` reads both. TypeError for a value that no file of ours can hold.
+    result; without it they become lists. `null` writes what is not finite as None, because strict
+    JSON has no other word for it, and `from_plain` reads NaN. TypeError for a value that no file of ours can hold.
     """
     return _plain(record, "", arrays, apart, null)
 
@@ -68,7 +69,7 @@ def _plain(
     if isinstance(value, Enum):
         return value.name
     if isinstance(value, float):
-        return None if null and value != value else value
+        return None if null and not math.isfinite(value) else value
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, list | tuple):
@@ -264,6 +265,11 @@ def _check_sizes(record: Any, name: str) -> None:
     for field in getattr(record, "FINITE", ()):
         if not np.isfinite(getattr(record, field)).all():
             raise ValueError(f"{_below(name, field)} holds a value that is not finite")
+
+
+def hash_of(value: Any) -> str:
+    """SHA-256 of a record, or of plain values, that does not depend on the order of keys."""
+    return hashlib.sha256(json.dumps(to_plain(value), sort_keys=True).encode()).hexdigest()
 
 
 def write_json(record: Any, path: PathLike) -> None:

@@ -4,8 +4,6 @@ they depend on.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import pickle
 import secrets
@@ -28,7 +26,7 @@ from starcal_uq.core.files import (
     sweep_temporary,
 )
 from starcal_uq.core.provenance import installed_versions
-from starcal_uq.core.records import to_plain
+from starcal_uq.core.records import hash_of
 from starcal_uq.core.types import AnyDict, PathLike
 
 if TYPE_CHECKING:
@@ -128,8 +126,7 @@ class Kept:
     def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:
         import pyarrow as pa
 
-        told = to_plain([identity, installed_versions()])
-        self._identity = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        self._identity = hash_of([identity, installed_versions()])
         self._kinds = {(kind.__module__, kind.__name__): kind for kind in kinds}
         schema = pa.schema([("key", pa.string()), ("result", pa.binary())])
 

@@ -18,7 +18,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.camera.planes import PINHOLE, Plane
 from starcal_uq.camera.projection import unproject_theta
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 from starcal_uq.observations.frames import StarFrames
 
 # Pairs tried per frame; with a third of all stars wrong, none of 32 pairs is right in one frame of
@@ -55,7 +55,7 @@ def consensus(
     (one, or (N,)).
     """
     sizes = np.diff(starts)
-    tolerance = np.broadcast_to(np.asarray(tolerance_rad, dtype=np.float64), b.shape[1:])
+    tolerance = np.broadcast_to(floats(tolerance_rad), b.shape[1:])
     with np.errstate(invalid="ignore", divide="ignore"):
         best, rotations = np.full(len(sizes), np.inf), np.full((len(sizes), 3, 3), np.nan)
         for first, second in pair_trials(starts):

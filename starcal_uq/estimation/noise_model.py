@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.settings import ITERATIONS
 from starcal_uq.estimation.stages import REFINEMENT_TOLERANCE, Search, refinement_stage
 from starcal_uq.likelihood.arrays import BLOCK_STARS
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -383,7 +383,7 @@ class _Stars(NamedTuple):
 
     def per_frame(self, values: FloatArray) -> FloatArray:
         """Sums over the stars of each frame."""
-        return np.asarray(np.bincount(self.frame, values, self.n_frames), dtype=np.float64)
+        return floats(np.bincount(self.frame, values, self.n_frames))
 
     def price(self, n_terms: int) -> float:
         """What terms must gain by Schwarz's criterion; few stars follow any of them by chance."""
@@ -471,7 +471,7 @@ def _fitted(stars: _Stars, terms: tuple[str, ...], with_frames: bool) -> _Fit:
     design = _design(stars, terms)
     information = 0.5 * (design.T * stars.share) @ design
     beta = _scored(design, stars.squares, stars.share, information)
-    errors = np.sqrt(np.diag(np.linalg.inv(information)))
+    errors = root_diagonal(np.linalg.inv(information))
     if not with_frames:
         eta = design @ beta
         log_likelihood = -0.5 * float(

@@ -25,7 +25,7 @@ import numpy as np
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 from starcal_uq.estimation.consensus import MIN_STARS
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
@@ -104,7 +104,7 @@ class StarResiduals:
 
 def star_threshold(p_value: float, dof: FloatArray | float) -> FloatArray:
     """Value of the studentised statistic that a right star exceeds with probability `p_value`."""
-    dof = np.asarray(dof, dtype=np.float64)
+    dof = floats(dof)
     threshold: FloatArray = dof * np.expm1(-2.0 * np.log(p_value) / dof)
     return threshold
 

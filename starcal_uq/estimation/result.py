@@ -26,7 +26,7 @@ from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, w
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes, floats
 from starcal_uq.estimation.kept import KeptFrames
 from starcal_uq.estimation.prediction import PredictedCamera, displacement, predicted
 from starcal_uq.estimation.residual_map import PartitionSums
@@ -425,7 +425,7 @@ class Calibration(Deferring, Shown, Traced):
         covariance : (n, 2, 2) array
             Its covariance, px^2.
         """
-        pixels = np.atleast_2d(np.asarray(xy, dtype=np.float64))
+        pixels = np.atleast_2d(floats(xy))
         estimate = PredictedCamera(self.camera, self.covariance)
         return displacement(estimate, self.known_effects, pixels, names)
 
@@ -433,7 +433,7 @@ class Calibration(Deferring, Shown, Traced):
         """Unit vectors (n, 3) in the camera frame of what is seen at pixels (n, 2), by the camera
         and the effects of the place.
         """
-        pixels = np.atleast_2d(np.asarray(xy, dtype=np.float64))
+        pixels = np.atleast_2d(floats(xy))
         return unproject(self.camera, pixels - self.displacement(pixels)[0])
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -239,7 +239,7 @@ def refine(
     )
     with np.errstate(all="ignore"):
         errors = (
-            np.sqrt(np.diag(np.linalg.inv(-shape))) if np.any(shape) else np.full(1 + free, np.nan)
+            root_diagonal(np.linalg.inv(-shape)) if np.any(shape) else np.full(1 + free, np.nan)
         )
     return RobustFit(
         stage=stage,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from starcal_uq.attitude.earth import LOWEST, air_constants, normalised, sphere
+from starcal_uq.core.types import floats
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.fitted_effects import FoundAir
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -218,7 +219,7 @@ def _settled(images: Images, start: Zeniths) -> Settled:
             damping *= 10.0
         step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), pull)
         trial = known.moved(step, images.boresights)
-    covariance = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    covariance = floats(np.linalg.inv(matrix))
     return Settled(known, known.mean + covariance @ pull, covariance)
 
 

@@ -23,7 +23,7 @@ from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.proposers import Proposer
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis
 from starcal_uq.identification.result import FrameStatus
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.maths.linear import root_diagonal, scaled_inverse
 from starcal_uq.sky.catalogue import StarCatalogue
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class Search:
     def narrowed(self, camera: Camera, covariance: FloatArray) -> Search:
         """The same for a camera known from the frames so far."""
         other = copy(self)
-        sd = 4.0 * np.sqrt(np.diag(covariance))
+        sd = 4.0 * root_diagonal(covariance)
         focal, dx, dy, kappa = sd.tolist()
         # Not below what a lens model with few terms leaves over.
         other.tolerance = self.tolerance.at_most(

@@ -13,6 +13,7 @@ from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.search import CentroidTable
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.observations.origin import CentroidsOrigin
 
 # A frame is searched again when a tolerance is smaller than this part of what it was.
@@ -71,7 +72,7 @@ def calibrated_tolerance(
     camera = calibration.camera
     p = len(camera.parameter_names)
     covariance = floats(calibration.covariance)[:p, :p]
-    sd = 4.0 * np.sqrt(np.diag(covariance))
+    sd = 4.0 * root_diagonal(covariance)
     orders = [c.order for c in get_model(camera.distortion).coefficients]
     corner = camera.corner_radius_px ** np.array(orders, dtype=np.float64)
     bend = 4.0 * float(np.sqrt(corner @ covariance[3:, 3:] @ corner)) if orders else 0.0

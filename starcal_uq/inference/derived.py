@@ -7,14 +7,13 @@ parameters can look settled while a difference of them is not.
 
 from __future__ import annotations
 
-import numpy as np
-
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.fields import corner_displacement_px
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.inference import arviz as arviz_compat
 from starcal_uq.inference.posterior import Derived, Posterior
+from starcal_uq.maths.intervals import mean_and_sd
 
 
 def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
@@ -38,7 +37,7 @@ def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
 
 
 def _diagnosed(post: Posterior, name: str, unit: str, values: FloatArray) -> Derived:
-    mean, sd = float(np.mean(values)), float(np.std(values, ddof=1))
+    mean, sd = mean_and_sd(values)
     # In standard units: tiny ranges mislead the diagnostics.
     chains = ((values - mean) / (sd or 1.0)).reshape(post.n_ensembles, -1)
     return Derived(

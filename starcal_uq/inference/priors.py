@@ -26,7 +26,7 @@ from starcal_uq.core.findings import clause
 from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
-from starcal_uq.maths.linear import correlation_of, root_diagonal
+from starcal_uq.maths.linear import correlation_of, root_diagonal, symmetric
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -456,12 +456,12 @@ class GaussianPriors(Priors):
                 "the prior's mean and covariance must be finite, with variances above zero."
             )
         correlation, _ = correlation_of(covariance)
-        symmetric = np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9)
-        if not symmetric or np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] < 1e-12:
+        alike = np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9)
+        if not alike or np.linalg.eigvalsh(symmetric(correlation))[0] < 1e-12:
             raise PriorError("the prior's covariance must be symmetric and positive definite.")
         for name, value in (
             ("theta_mean", mean),
-            ("theta_covariance", 0.5 * (covariance + covariance.T)),
+            ("theta_covariance", symmetric(covariance)),
         ):
             value.setflags(write=False)
             object.__setattr__(self, name, value)

@@ -20,7 +20,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.posterior import Laplace
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.differences import derivatives
-from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
+from starcal_uq.maths.linear import scaled_cholesky, symmetric, symmetric_inverse
 
 # Half width of the finite differences in standard deviations: the density is so near to a parabola
 # over it that truncation is below 1e-3, while rounding of a log likelihood of 1e5 stays below 1e-8.
@@ -178,8 +178,7 @@ def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
 
 
 def _outer(factor: FloatArray) -> FloatArray:
-    product = factor @ factor.T
-    return 0.5 * (product + product.T)
+    return symmetric(factor @ factor.T)
 
 
 def curvature(target: Target) -> FloatArray:

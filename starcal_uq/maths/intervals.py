@@ -17,6 +17,11 @@ from starcal_uq.core.types import FloatArray, floats
 HALF_WIDTH_95, HALF_WIDTH_997 = 1.959963984540054, 2.9677379253417833
 
 
+def mean_and_sd(values: FloatArray) -> tuple[float, float]:
+    """Mean of a sample, and its standard deviation with one degree of freedom less."""
+    return float(np.mean(values)), float(np.std(values, ddof=1))
+
+
 def student_quantile(probability: float, dof: float) -> float:
     """Half-width of an interval for a mean whose standard deviation was estimated, in those
     standard deviations.

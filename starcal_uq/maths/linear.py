@@ -4,7 +4,10 @@ magnitude.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from starcal_uq.core.types import BoolArray, FloatArray
 
@@ -17,9 +20,14 @@ _WORST_CONDITION = 1e13
 _ROUNDING = 1e-9
 
 
-def root_diagonal(matrix: FloatArray) -> FloatArray:
+def root_diagonal(matrix: NDArray[np.floating[Any]]) -> FloatArray:
     """Roots (p,) of the diagonal of a matrix: the standard deviations of a covariance."""
     return np.sqrt(np.diag(matrix))
+
+
+def symmetric(matrix: FloatArray) -> FloatArray:
+    """Symmetric part (p, p) of a matrix, which is one but for rounding."""
+    return np.asarray(0.5 * (matrix + matrix.T))
 
 
 def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -51,7 +59,7 @@ def principal(
     """Eigenvalues (r,) of a symmetric matrix (p, p) above `least`, or that share of the largest
     one, and their vectors (p, r).
     """
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    values, vectors = np.linalg.eigh(symmetric(matrix))
     kept = values > (least * values[-1] if relative else least)
     return values[kept], vectors[:, kept]
 
@@ -116,7 +124,7 @@ def symmetric_inverse(matrix: FloatArray) -> FloatArray:
         raise np.linalg.LinAlgError("the diagonal is not positive")
     correlation, sd = correlation_of(matrix)
     inverse = np.linalg.inv(correlation) / np.outer(sd, sd)
-    return np.asarray(0.5 * (inverse + inverse.T))
+    return symmetric(inverse)
 
 
 def scaled_cholesky(covariance: FloatArray) -> FloatArray:

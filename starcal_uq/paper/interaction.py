@@ -36,6 +36,7 @@ from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
+from starcal_uq.maths.intervals import mean_and_sd
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.recursive.start import RecursionOptions
@@ -538,7 +539,7 @@ def _summary(clean: FloatArray, full: FloatArray) -> AnyDict:
     n = len(clean)
     if n < 2:
         return {}
-    bias, design = float(np.mean(clean)), float(np.std(clean, ddof=1))
+    bias, design = mean_and_sd(clean)
     change = full - clean
     noise, spread = float(np.std(change, ddof=1)), float(np.std(full, ddof=1))
     low, high = chi_interval(n)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from starcal_uq.core.types import FloatArray, floats
-from starcal_uq.maths.intervals import HALF_WIDTH_95
+from starcal_uq.maths.intervals import HALF_WIDTH_95, mean_and_sd
 from starcal_uq.paper.published import Printed
 
 # Of 24 numbers under the right reading, one in fifteen tables has one beyond.
@@ -159,14 +159,14 @@ def trial(
     step = number.unit_in_last_place
     if number.is_error_size:
         logs = np.log(np.maximum(values, np.finfo(float).tiny))
-        middle, width = float(np.mean(logs)), float(np.std(logs, ddof=1))
+        middle, width = mean_and_sd(logs)
         rounding = step / number.value
         distance = float(np.log(number.value)) - middle
         mean = float(np.exp(middle))
         spread = mean * width
         covered = mean * 2.0 * float(np.sinh(HALF_WIDTH_95 * width))
     else:
-        mean, spread = float(np.mean(values)), float(np.std(values, ddof=1))
+        mean, spread = mean_and_sd(values)
         middle, width, rounding, distance = mean, spread, step, number.value - mean
         covered = 2.0 * HALF_WIDTH_95 * spread
     if spread <= _ROUNDING * abs(mean):

@@ -189,7 +189,7 @@ def coupling(result: HasCovariance) -> Coupling:
     names = tuple(spec.name for spec in specs)
     covariance = floats(result.covariance)
     correlation, sigma = correlation_of(covariance)
-    conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
+    conditional = sigma / root_diagonal(np.linalg.inv(correlation))
     information = floats(result.information)
     inverse, scale = unit_inverse(information)
     bound = root_diagonal(inverse) * scale

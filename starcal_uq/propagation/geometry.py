@@ -12,7 +12,7 @@ from starcal_uq.attitude.rotations import left_error
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
 from starcal_uq.core.errors import DistortionError, ObservationError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import View
@@ -147,7 +147,7 @@ def responses(
     b, per_theta = unproject_jacobian(model, theta, xy)
     w = weights[:, None, None]
     information = _frame_sums(w * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
-    inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    inverse = floats(np.linalg.inv(information))
     by_theta = _frame_sums(w * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts)
     return b, per_theta, inverse, inverse @ np.swapaxes(by_theta, 1, 2)
 

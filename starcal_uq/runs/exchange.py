@@ -13,8 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera, write_kernel
@@ -29,6 +27,7 @@ from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.groups import write_arviz
 from starcal_uq.inference.posterior import Posterior
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.estimation import calibration_table
 from starcal_uq.presentation.words.inference import posterior_table
@@ -96,7 +95,7 @@ def export(
         write = None
         if to == "spice":
             specs = parameters(camera.distortion)
-            known = () if isinstance(what, Camera) else np.sqrt(np.diag(what.covariance)).tolist()
+            known = () if isinstance(what, Camera) else root_diagonal(what.covariance).tolist()
             sigmas = tuple(zip(specs, known, strict=False))
             write = partial(write_kernel, instrument=instrument or NO_INSTRUMENT, sigmas=sigmas)
         return export_camera(camera, to, place, force=force, write=write)
@@ -150,7 +149,7 @@ def uncertain_values(
             return dict(zip(names, correlated_values(mean, covariance), strict=True))
         import GTC
 
-    sigma = np.sqrt(np.diag(covariance))
+    sigma = root_diagonal(covariance)
     found = GTC.multiple_ureal(mean, sigma.tolist(), math.inf, label_seq=names)
     for (i, one), (j, other) in itertools.combinations(enumerate(found), 2):
         GTC.set_correlation(float(covariance[i, j] / (sigma[i] * sigma[j])), one, other)

@@ -277,7 +277,7 @@ def covariance_numbers(
     """
     names = parameter_names(model)
     correlation, sigma = correlation_of(covariance[: len(names), : len(names)])
-    conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
+    conditional = sigma / root_diagonal(np.linalg.inv(correlation))
     weakest = weak_directions(correlation, names)[0]
     rotation = common @ covariance @ common.T
     turn = root_diagonal(rotation)

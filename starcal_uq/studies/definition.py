@@ -4,8 +4,6 @@ counted.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -22,6 +20,7 @@ from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_nam
 from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import PriorError, StarcalError, StudyError, check_known
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
+from starcal_uq.core.records import hash_of
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
@@ -476,7 +475,7 @@ def write_study_template(name: str, path: PathLike, force: bool = False) -> None
 
 
 def _hash(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
+    return hash_of(value)[:32]
 
 
 def _part(

@@ -4,8 +4,6 @@ information foretold.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +12,7 @@ import numpy as np
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.records import hash_of
 from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, ensemble_draws
 from starcal_uq.inference.named import quick_target
@@ -103,9 +102,7 @@ class SimulatedCells(Cells):
             self.definition.seed,
             cell.seed_index,
         ]
-        return int(
-            hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32], 16
-        )
+        return int(hash_of(content)[:32], 16)
 
     def _foretold(
         self, key: GeometryKey, geometry: Geometry, noise: FloatArray, cell: Cell, camera: Camera

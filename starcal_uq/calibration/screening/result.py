@@ -13,7 +13,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import ensure_new, write_csv
 from starcal_uq.core.findings import clause
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, floats
 from starcal_uq.estimation.consensus import MIN_STARS
 from starcal_uq.estimation.outliers import StarResiduals, star_threshold
 
@@ -254,7 +254,7 @@ def _taste_with(
 
     taste = (residuals.frame_cost[frame] + residuals.t[rows]) / residuals.variance(shrinkage)
     limit = chdtri(np.maximum(2 * residuals.frame_count[frame] - 1, 1), frame_p_value)
-    return taste, np.asarray(limit, dtype=np.float64)
+    return taste, floats(limit)
 
 
 def warnings_about(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.calibration.screening.result import MARGINAL
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, floats
 from starcal_uq.likelihood.student import DOF_RANGE
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def follows_place(xy: FloatArray, cal: Calibration) -> bool:
     """
     from scipy.special import chdtri
 
-    e = np.asarray(cal.residuals_px, dtype=np.float64)
+    e = floats(cal.residuals_px)
     length = np.hypot(*e.T)
     sign = e / np.where(length > 0.0, length, 1.0)[:, None]
     side = int(np.clip(np.sqrt(len(xy) / _PER_CELL), 2, _MOST_CELLS))

@@ -21,7 +21,7 @@ from starcal_uq.core.status import (
     Status,
     judged,
 )
-from starcal_uq.core.types import AnyDict, BoolArray
+from starcal_uq.core.types import AnyDict, BoolArray, floats
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.predictive import EXTREME_P
 from starcal_uq.diagnostics.verdict.effect import (
@@ -164,8 +164,8 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
     shape (p,).
     """
     if post is not None:
-        return np.asarray((post.mean - truth.theta) / post.sd[: len(post.mean)], dtype=np.float64)
-    return np.asarray((cal.theta - truth.theta) / cal.sigmas, dtype=np.float64)
+        return floats((post.mean - truth.theta) / post.sd[: len(post.mean)])
+    return floats((cal.theta - truth.theta) / cal.sigmas)
 
 
 # Frames that scatter by less than this beyond the formal errors are of no consequence, however

@@ -36,7 +36,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import PairCovariance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, floats
-from starcal_uq.maths.linear import root_diagonal
+from starcal_uq.maths.linear import root_diagonal, symmetric
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.innovations import PairNormals, frame_normals
 
@@ -386,7 +386,7 @@ class Recursion:
         covariance = keep @ step.prior @ keep.T + step.gain @ step.information @ step.gain.T
         if self.process is not None and n > 1:
             covariance = covariance + (n - 1) * np.diag(self.process)
-        self.covariance = 0.5 * (covariance + covariance.T)
+        self.covariance = symmetric(covariance)
         self.offset = step.offset
         self.chi2 = self.forgetting**n * self.chi2 + step.innovation
         self.numbers = self.forgetting**n * self.numbers + numbers

@@ -18,7 +18,7 @@ from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.solvers import is_singular
-from starcal_uq.maths.linear import correlation_of, root_diagonal
+from starcal_uq.maths.linear import correlation_of, root_diagonal, symmetric
 from starcal_uq.paper.recursive.filter import FrameSums, Recursion, entry_count, frame_entries
 from starcal_uq.paper.recursive.innovations import frame_normals
 
@@ -88,7 +88,7 @@ def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> Joint
     scale = recursion.scale
     return JointEstimate(
         theta=recursion.origin + scale * offset,
-        covariance=0.5 * (covariance + covariance.T) * np.outer(scale, scale),
+        covariance=symmetric(covariance) * np.outer(scale, scale),
         source="scatter of the frames" if scatter else "filter",
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -86,29 +85,20 @@ def plan_record(plan: Plan) -> AnyDict:
         "camera": plan.camera.to_dict(),
         **{name: getattr(plan, name) for name in _RECORDED},
         "effects": None if plan.effects is None else _costs(plan.effects),
-        "distortion": None if plan.distortion is None else _finite(to_plain(plan.distortion)),
+        "distortion": None if plan.distortion is None else to_plain(plan.distortion, null=True),
         "distortion_words": told("open_distortion", plan),
         "needs": to_plain(plan.needs),
         # What a campaign does not determine is infinite.
-        "forecast": _finite(plan.to_dataframe().to_dict("records")),
+        "forecast": to_plain(plan.to_dataframe().to_dict("records"), null=True),
         "provenance": plan.provenance,
     }
 
 
 def _costs(costs: EffectCosts) -> AnyDict:
     """Effects with their scales, and their costs, model by model."""
-    rows = _finite(costs.to_dataframe().to_dict("records"))
+    rows = to_plain(costs.to_dataframe().to_dict("records"), null=True)
     planned: AnyDict = to_plain(costs.planned)
     return planned | {"n_frames": costs.n_frames, "costs": rows}
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no number for what is infinite."""
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def plan_figures(

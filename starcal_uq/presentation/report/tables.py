@@ -24,6 +24,7 @@ from starcal_uq.core.formatting import (
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.estimate import truth_z
 from starcal_uq.inference.derived import derived_quantities
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
@@ -148,7 +149,7 @@ def pair_table(cal: Calibration) -> TextTable:
         "pairs",
         it=specs,
         theta=cal.pair_theta / scale,
-        sigma=np.sqrt(np.diag(cal.pair_covariance)) / scale,
+        sigma=root_diagonal(cal.pair_covariance) / scale,
         best=cal.theta / scale,
         least=cal.sigmas / scale,
     )

@@ -22,6 +22,7 @@ from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.inference.checks import COMPRESSED_BOUND
+from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.presentation.tables import TextTable, with_units
 from starcal_uq.presentation.words.sentences import table, told
 
@@ -47,7 +48,7 @@ def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
 def _sigmas(covariances: Mapping[str, FloatArray], specs: Sequence[Parameter]) -> AnyDict:
     """Sigmas in the units of `specs`, or in px units."""
     scales = [spec.scale for spec in specs] or 1.0
-    return {name: np.sqrt(np.diag(matrix)) / scales for name, matrix in covariances.items()}
+    return {name: root_diagonal(matrix) / scales for name, matrix in covariances.items()}
 
 
 def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTable:
