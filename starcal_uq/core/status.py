@@ -89,51 +89,35 @@ class Question(Enum):
     REQUIRED = "required"
 
 
-class Code(Enum):
-    """What a check asks: its title, and the question that it helps to answer."""
+# What a check asks, in the words of its title. A requirement is one of a budget, by its name.
+Code = Enum(
+    "Code",
+    """
+    ESTIMATION MODEL_THAT_THE_DATA_DETERMINE TWO_ESTIMATORS OTHER_STARTS KNOWN_ROTATIONS
+    DATA_OF_THE_POSTERIOR R_HAT EFFECTIVE_DRAWS ACCEPTANCE DERIVED_QUANTITIES DIGITS
+    DEGREES_OF_FREEDOM BOUNDS INDEPENDENT_POSTERIOR LIKELIHOOD KIND_OF_LIKELIHOOD
+    METHOD_OF_THE_CALIBRATION INFLUENCE_OF_THE_PRIORS CATALOGUE_DIRECTIONS
+    PATTERN_IN_THE_RESIDUALS OUTLIERS SCREENING FACTOR_ON_THE_STATED_NOISE
+    FACTOR_ON_THE_FITTED_NOISE CENTROID_NOISE_PER_AXIS NOISE_OF_THE_FILES
+    TERMS_OF_THE_DISTORTION COVERAGE_OF_THE_FIELD UNEXPLAINED_STRUCTURE EVENNESS_OF_THE_NOISE
+    ONE_CAMERA JACKKNIFE_OVER_FRAMES ERRORS_OF_THE_STARS DISTORTION_MODEL
+    POSTERIOR_PREDICTIVE_CHECK PROPAGATION_TO_ATTITUDE KNOWN_TRUTH REQUIREMENT
+    """,
+)
+# The questions that checks help to answer; the others ask whether the result is trustworthy.
+_QUESTIONS = {"REQUIREMENT": Question.REQUIRED} | dict.fromkeys(
+    ["ESTIMATION", "TWO_ESTIMATORS", "OTHER_STARTS", "DATA_OF_THE_POSTERIOR", "R_HAT", "EFFECTIVE_DRAWS", "ACCEPTANCE", "DERIVED_QUANTITIES", "DIGITS", "DEGREES_OF_FREEDOM", "BOUNDS"],
+    Question.CONVERGED,
+)
 
-    ESTIMATION = "Estimation", Question.CONVERGED
-    MODEL_THAT_THE_DATA_DETERMINE = "Model that the data determine", Question.TRUSTWORTHY
-    TWO_ESTIMATORS = "Two estimators", Question.CONVERGED
-    OTHER_STARTS = "Other starts", Question.CONVERGED
-    KNOWN_ROTATIONS = "Known rotations", Question.TRUSTWORTHY
-    DATA_OF_THE_POSTERIOR = "Data of the posterior", Question.CONVERGED
-    R_HAT = "R-hat", Question.CONVERGED
-    EFFECTIVE_DRAWS = "Effective draws", Question.CONVERGED
-    ACCEPTANCE = "Acceptance", Question.CONVERGED
-    DERIVED_QUANTITIES = "Derived quantities", Question.CONVERGED
-    DIGITS = "Digits", Question.CONVERGED
-    DEGREES_OF_FREEDOM = "Degrees of freedom", Question.CONVERGED
-    BOUNDS = "Bounds", Question.CONVERGED
-    INDEPENDENT_POSTERIOR = "Independent posterior", Question.TRUSTWORTHY
-    LIKELIHOOD = "Likelihood", Question.TRUSTWORTHY
-    KIND_OF_LIKELIHOOD = "Kind of likelihood", Question.TRUSTWORTHY
-    METHOD_OF_THE_CALIBRATION = "Method of the calibration", Question.TRUSTWORTHY
-    INFLUENCE_OF_THE_PRIORS = "Influence of the priors", Question.TRUSTWORTHY
-    CATALOGUE_DIRECTIONS = "Catalogue directions", Question.TRUSTWORTHY
-    PATTERN_IN_THE_RESIDUALS = "Pattern in the residuals", Question.TRUSTWORTHY
-    OUTLIERS = "Outliers", Question.TRUSTWORTHY
-    SCREENING = "Screening", Question.TRUSTWORTHY
-    FACTOR_ON_THE_STATED_NOISE = "Factor on the stated noise", Question.TRUSTWORTHY
-    FACTOR_ON_THE_FITTED_NOISE = "Factor on the fitted noise", Question.TRUSTWORTHY
-    CENTROID_NOISE_PER_AXIS = "Centroid noise per axis", Question.TRUSTWORTHY
-    NOISE_OF_THE_FILES = "Noise of the files", Question.TRUSTWORTHY
-    TERMS_OF_THE_DISTORTION = "Terms of the distortion", Question.TRUSTWORTHY
-    COVERAGE_OF_THE_FIELD = "Coverage of the field", Question.TRUSTWORTHY
-    UNEXPLAINED_STRUCTURE = "Unexplained structure", Question.TRUSTWORTHY
-    EVENNESS_OF_THE_NOISE = "Evenness of the noise", Question.TRUSTWORTHY
-    ONE_CAMERA = "One camera", Question.TRUSTWORTHY
-    JACKKNIFE_OVER_FRAMES = "Jackknife over frames", Question.TRUSTWORTHY
-    ERRORS_OF_THE_STARS = "Errors of the stars", Question.TRUSTWORTHY
-    DISTORTION_MODEL = "Distortion model", Question.TRUSTWORTHY
-    POSTERIOR_PREDICTIVE_CHECK = "Posterior predictive check", Question.TRUSTWORTHY
-    PROPAGATION_TO_ATTITUDE = "Propagation to attitude", Question.TRUSTWORTHY
-    KNOWN_TRUTH = "Known truth", Question.TRUSTWORTHY
-    REQUIREMENT = "Requirement", Question.REQUIRED  # Of a budget, by its name
+
+def title_of(code: Code) -> str:
+    """The title of a check."""
+    return "R-hat" if code is Code.R_HAT else code.name.capitalize().replace("_", " ")
 
 
 # Codes by their titles.
-CODES = {code.value[0]: code for code in Code}
+CODES = {title_of(code): code for code in Code}
 
 
 # What to do with the instrument or the data.
@@ -261,12 +245,12 @@ class Check(Finding):
     @property
     def name(self) -> str:
         """Short name."""
-        return self.title or self.code.value[0]
+        return self.title or title_of(self.code)
 
     @property
     def question(self) -> Question:
         """Question that the check answers."""
-        return self.code.value[1]
+        return _QUESTIONS.get(self.code.name, Question.TRUSTWORTHY)
 
     @property
     def ways(self) -> tuple[tuple[str, bool], ...]:

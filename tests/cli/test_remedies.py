@@ -22,7 +22,7 @@ import starcal_uq as sc
 from starcal_uq.calibration.cameras import MixedCameras
 from starcal_uq.cli.commands import app
 from starcal_uq.core import remedy
-from starcal_uq.core.status import Code, Level, Status
+from starcal_uq.core.status import CODES, Check, Code, Level, Question, Status
 from starcal_uq.diagnostics.diagnose import MultiStart
 from starcal_uq.diagnostics.times import TimeTest
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
@@ -503,7 +503,9 @@ def test_every_check_has_a_sentence_a_remedy_and_a_place_in_the_documentation(
     # Requirements have the names and the words of a budget: tests/cli/test_mission.py.
     assert small.codes == set(Code) - {Code.REQUIREMENT}
     rows = re.findall(r"^\| ([^|]*) \|", (root / DOCUMENTED).read_text(encoding="utf-8"), re.M)
-    assert [code.value[0] for code in Code if code.value[0] not in rows] == []
+    assert [title for title in CODES if title not in rows] == []
+    asked = [check.question for check in map(Check, Code)]
+    assert [asked.count(question) for question in Question] == [11, 26, 1]
     # Control: the title of no check is in no row.
     assert "Requirements" not in rows
 
