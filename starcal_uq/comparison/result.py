@@ -13,7 +13,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import read_json, to_plain, write_json
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
@@ -124,13 +124,15 @@ class CameraComparison(Shown):
     messages: tuple[str, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
 
-    SHAPES: ClassVar[Shapes] = {
-        **{"x_px": ("x",), "y_px": ("y",), "sigma_arcsec": ("y", "x"), "ratio": ("y", "x")},
-        **{"difference_arcsec": ("y", "x", 2), "difference_px": ("y", "x", 2)},
-        **{"rotation_arcsec": (3,), "rotation_covariance_arcsec2": (3, 3)},
-        **dict.fromkeys(("parameter_names", "parameter_units"), ("q",)),
-        **dict.fromkeys(("theta_a", "theta_b", "sd_a", "sd_b", "sd_difference"), ("q",)),
-    }
+    SHAPES: ClassVar = """
+        x: x_px
+        y: y_px
+        y x: sigma_arcsec ratio
+        y x 2: difference_arcsec difference_px
+        3: rotation_arcsec
+        3 3: rotation_covariance_arcsec2
+        q: parameter_names parameter_units theta_a theta_b sd_a sd_b sd_difference
+    """
 
     @property
     def tested(self) -> bool:

@@ -231,29 +231,36 @@ def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any
     return made
 
 
+@cache
+def _sizes(shapes: str) -> dict[str, list[str]]:
+    """Sizes by field."""
+    lines = [line.split(":") for line in shapes.strip().splitlines()]
+    return {field: sizes.split() for sizes, names in lines for field in names.split()}
+
+
 def _check_sizes(record: Any, name: str) -> None:
     """Arrays must have the sizes that the class states, and where it says so no gap.
 
-    ``SHAPES`` of a class are sizes by field (or property): digits, or names of sizes that are the
-    same wherever they stand, such as ``{"theta": ("p",), "draws": ("n", "p+1")}``; a tuple has its
+    ``SHAPES`` of a class has a line for each shape, with its fields (or properties): digits, or
+    names of sizes that are the same wherever they stand, such as ``n p+1: draws``; a tuple has its
     length. Fields in ``FINITE`` hold neither NaN nor infinities.
     """
     # A number is its own size.
     sizes = {str(number): number for number in range(10)}
     empty: dict[str, set[str]] = {}
-    for field, wanted in getattr(record, "SHAPES", {}).items():
+    for field, wanted in _sizes(getattr(record, "SHAPES", "")).items():
         value = getattr(record, field)
         if value is None:
             continue
         shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
         place = _below(name, field)
         if shape == (0,) and len(wanted) > 1:
-            empty[place] = {str(want).partition("+")[0] for want in wanted}
+            empty[place] = {want.partition("+")[0] for want in wanted}
             continue
         if len(shape) != len(wanted):
             raise ValueError(f"{place} has {len(shape)} dimensions, not {len(wanted)}")
         for size, want in zip(shape, wanted, strict=True):
-            letter, _, more = str(want).partition("+")
+            letter, _, more = want.partition("+")
             extra = int(more or 0)
             right = sizes.setdefault(letter, size - extra) + extra
             if size != right:

@@ -105,10 +105,12 @@ Code = Enum(
     """,
 )
 # The questions that checks help to answer; the others ask whether the result is trustworthy.
-_QUESTIONS = {"REQUIREMENT": Question.REQUIRED} | dict.fromkeys(
-    ["ESTIMATION", "TWO_ESTIMATORS", "OTHER_STARTS", "DATA_OF_THE_POSTERIOR", "R_HAT", "EFFECTIVE_DRAWS", "ACCEPTANCE", "DERIVED_QUANTITIES", "DIGITS", "DEGREES_OF_FREEDOM", "BOUNDS"],
-    Question.CONVERGED,
-)
+_OF_THE_COMPUTATION = """
+    ESTIMATION TWO_ESTIMATORS OTHER_STARTS DATA_OF_THE_POSTERIOR R_HAT EFFECTIVE_DRAWS ACCEPTANCE
+    DERIVED_QUANTITIES DIGITS DEGREES_OF_FREEDOM BOUNDS
+    """
+_QUESTIONS = dict.fromkeys(_OF_THE_COMPUTATION.split(), Question.CONVERGED)
+_QUESTIONS["REQUIREMENT"] = Question.REQUIRED
 
 
 def title_of(code: Code) -> str:

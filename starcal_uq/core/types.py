@@ -19,8 +19,6 @@ AnyMapping: TypeAlias = Mapping[str, Any]
 PathLike: TypeAlias = str | os.PathLike[str]
 # Called with how many are done, and of how many.
 Progress: TypeAlias = Callable[[int, int], None]
-# Sizes of the arrays of a record, by field; see `starcal_uq.core.records`.
-Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]
 
 
 _ELEMENTS = {

@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import FloatArray, Shapes, floats
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.diagnostics.beside import normals_beside
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
@@ -73,17 +73,11 @@ class Jackknife(Shown):
     residual_dof: int = 0
     tail_dof: FloatArray | None = None
 
-    SHAPES: ClassVar[Shapes] = {
-        **{
-            "parameter_names": ("p",),
-            "left_out": ("k", "p"),
-            "effective_frames": ("p",),
-            "tail_dof": ("p",),
-        },
-        **dict.fromkeys(
-            ("formal_covariance", "jackknife_covariance", "sandwich_covariance"), ("p", "p")
-        ),
-    }
+    SHAPES: ClassVar = """
+        p: parameter_names effective_frames tail_dof
+        k p: left_out
+        p p: formal_covariance jackknife_covariance sandwich_covariance
+    """
 
     @property
     def ratio(self) -> FloatArray:

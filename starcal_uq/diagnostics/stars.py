@@ -22,7 +22,7 @@ import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.diagnostics.beside import without_effects
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF
 from starcal_uq.estimation.normals import StarNormals
@@ -98,11 +98,10 @@ class StarTest(Shown):
     included_px: float = 0.0
     included_px_std: float = 0.0
 
-    SHAPES: ClassVar[Shapes] = {
-        "parameter_names": ("p",),
-        **dict.fromkeys(("formal_covariance", "model_covariance"), ("p", "p")),
-        **dict.fromkeys(("sandwich_covariance", "jackknife_covariance"), ("p", "p")),
-    }
+    SHAPES: ClassVar = """
+        p: parameter_names
+        p p: formal_covariance model_covariance sandwich_covariance jackknife_covariance
+    """
 
     @property
     def applicable(self) -> bool:

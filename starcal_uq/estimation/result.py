@@ -26,7 +26,7 @@ from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, w
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes, floats
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, floats
 from starcal_uq.estimation.kept import KeptFrames
 from starcal_uq.estimation.prediction import PredictedCamera, displacement, predicted
 from starcal_uq.estimation.residual_map import PartitionSums
@@ -210,18 +210,16 @@ class Calibration(Deferring, Shown, Traced):
     star_weights: FloatArray | None = None
     ties: FittedTies | None = None
 
-    SHAPES: ClassVar[Shapes] = {
-        **{
-            "parameter_names": ("p",),
-            "theta": ("p",),
-            "covariance": ("p", "p"),
-            "information": ("p", "p"),
-        },
-        **{"frame_ids": ("k",), "quaternions": ("k", 4), "residuals_px": ("n", 2)},
-        **{"rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
-        **{"pair_theta": ("p",), "pair_covariance": ("p", "p")},
-    }
-    FINITE: ClassVar[tuple[str, ...]] = ("theta", "covariance", "sigma", "sigma_std", "information")
+    SHAPES: ClassVar = """
+        p: parameter_names theta pair_theta
+        p p: covariance information pair_covariance
+        k: frame_ids
+        k 4: quaternions
+        n 2: residuals_px
+        3 p: rotation_per_theta
+        3 3: attitude_noise
+    """
+    FINITE: ClassVar = ("theta", "covariance", "sigma", "sigma_std", "information")
 
     @classmethod
     def of(

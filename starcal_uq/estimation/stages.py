@@ -16,7 +16,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import DistortionModel, get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.settings import ITERATIONS
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
@@ -105,7 +105,10 @@ class Stage:
     seconds: float
     sigmas: FloatArray | None = None
 
-    SHAPES: ClassVar[Shapes] = {"trajectory": ("n", "p"), "cost": ("n",), "sigmas": ("n", "p")}
+    SHAPES: ClassVar = """
+        n p: trajectory sigmas
+        n: cost
+    """
 
     @property
     def iterations(self) -> int:

@@ -24,7 +24,7 @@ from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.status import CODES, Check, Level, Words, worst
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 from starcal_uq.likelihood.fitted_effects import Effects
 
@@ -72,12 +72,10 @@ class Laplace:
     iterations: int
     converged: bool
 
-    SHAPES: ClassVar[Shapes] = {
-        "names": ("d",),
-        "mode": ("d",),
-        "covariance": ("d", "d"),
-        "transform": ("d", "d"),
-    }
+    SHAPES: ClassVar = """
+        d: names mode
+        d d: covariance transform
+    """
 
     @property
     def mean(self) -> FloatArray:
@@ -193,13 +191,9 @@ class Diagnostics:
     compressed_frames: tuple[int, int] = (0, 0)
     derived: tuple[Derived, ...] = ()
 
-    SHAPES: ClassVar[Shapes] = {
-        **dict.fromkeys(
-            ("rhat", "ess_bulk", "ess_tail", "mcse", "autocorrelation", "psis_mean", "psis_sd"),
-            ("p",),
-        ),
-        **dict.fromkeys(("laplace_mean", "laplace_sd"), ("p",)),
-    }
+    SHAPES: ClassVar = """
+        p: rhat ess_bulk ess_tail mcse autocorrelation psis_mean psis_sd laplace_mean laplace_sd
+    """
 
     @property
     def level(self) -> Level:
@@ -273,16 +267,15 @@ class Posterior(Shown, Traced):
     star_error_px: float = 0.0
     effects: Effects | None = None
 
-    SHAPES: ClassVar[Shapes] = {
-        **{
-            "parameter_names": ("p+1",),
-            "draws": ("n", "p+1"),
-            "log_posterior": ("n",),
-            "dof_draws": ("n",),
-        },
-        **{"information": ("p", "p"), "rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
-    }
-    FINITE: ClassVar[tuple[str, ...]] = (
+    SHAPES: ClassVar = """
+        p+1: parameter_names
+        n p+1: draws
+        n: log_posterior dof_draws
+        p p: information
+        3 p: rotation_per_theta
+        3 3: attitude_noise
+    """
+    FINITE: ClassVar = (
         "draws",
         "log_posterior",
         "information",

@@ -19,7 +19,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood import arrays
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood, Profile
 from starcal_uq.likelihood.paths import sums_for
@@ -49,15 +49,12 @@ class CompressedLikelihood:
     n_stars: int
     n_frames: int
 
-    SHAPES: ClassVar[Shapes] = {
-        **{
-            "theta_hat": ("p",),
-            "whitening": ("p", "p"),
-            "gram": ("q", "q"),
-            "log_determinant_slope": ("p",),
-        }
-    }
-    FINITE: ClassVar[tuple[str, ...]] = ("theta_hat", "whitening", "gram", "log_determinant_slope")
+    SHAPES: ClassVar = """
+        p: theta_hat log_determinant_slope
+        p p: whitening
+        q q: gram
+    """
+    FINITE: ClassVar = ("theta_hat", "whitening", "gram", "log_determinant_slope")
 
     def whiten(self, theta: FloatArray) -> FloatArray:
         """Whitened parameters z (n, p) of theta (n, p)."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.types import AnyDict, FloatArray, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.likelihood.compressed import CompressedLikelihood, optimum
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.shapes import Extent
@@ -150,17 +150,15 @@ class Effects(Shown):
     # Root mean square of the direction errors that the catalogue of the effect `star` states, px
     stated_px: float = 0.0
 
-    SHAPES: ClassVar[Shapes] = {
-        "coefficients": ("m",),
-        "covariance": ("m", "m"),
-        "cross": ("p", "m"),
-        "node_grams": ("j", "q", "q"),
-        "node_log_weights": ("j",),
-        "frames": ("k", "c"),
-        "frame_sigmas": ("k", "c"),
-        "stars": ("s", 2),
-        "star_sigmas": ("s", 2),
-    }
+    SHAPES: ClassVar = """
+        m: coefficients
+        m m: covariance
+        p m: cross
+        j q q: node_grams
+        j: node_log_weights
+        k c: frames frame_sigmas
+        s 2: stars star_sigmas
+    """
 
     @classmethod
     def of_stars(cls, stars: AnyDict, compressed: CompressedLikelihood) -> Effects:

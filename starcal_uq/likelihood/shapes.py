@@ -24,7 +24,7 @@ from starcal_uq.camera.distortion import (
     shared_names,
 )
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
-from starcal_uq.core.types import FloatArray, IntArray, Shapes, StrArray, floats
+from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 
 if TYPE_CHECKING:
@@ -149,11 +149,10 @@ class Extent:
     magnitude: FloatArray
     nights_s: FloatArray  # (E, 2): first and last moment of every night, seconds since 1970
 
-    SHAPES: ClassVar[Shapes] = {
-        "temperature_c": (3,),
-        "magnitude": (3,),
-        "nights_s": ("e", 2),
-    }
+    SHAPES: ClassVar = """
+        3: temperature_c magnitude
+        e 2: nights_s
+    """
 
     @classmethod
     def of(cls, obs: Observations) -> Extent:

@@ -30,7 +30,7 @@ from starcal_uq.attitude.relative import RelativeAttitudes
 from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_vector
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.types import FloatArray, IntArray, Shapes
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.compressed import CompressedLikelihood, gram_sums
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.likelihood.sums import ATTITUDE_TOLERANCE_RAD, Attitudes, NormalSums
@@ -92,7 +92,7 @@ class FittedTies:
     sigma: float
     sigmas_without: FloatArray
 
-    SHAPES: ClassVar[Shapes] = {"sigmas_without": ("p",)}
+    SHAPES: ClassVar = "p: sigmas_without"
 
 
 @dataclass(frozen=True, eq=False)

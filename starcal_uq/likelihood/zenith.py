@@ -27,7 +27,7 @@ from starcal_uq.attitude.earth import (
     tangents,
 )
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.types import FloatArray, IntArray, Shapes
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.shapes import Shape, View
 
 if TYPE_CHECKING:
@@ -56,12 +56,12 @@ class Zeniths:
     # (m,): slopes by the coefficients of the log of what the data leave open of the zeniths
     pull: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    SHAPES: ClassVar[Shapes] = {
-        "frame_ids": ("k",),
-        "axes": ("k", 3, 3),
-        "places": ("n", 3),
-        "pull": ("m",),
-    }
+    SHAPES: ClassVar = """
+        k: frame_ids
+        k 3 3: axes
+        n 3: places
+        m: pull
+    """
 
     @property
     def apiece(self) -> bool:

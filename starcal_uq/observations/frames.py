@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -44,12 +44,12 @@ class StarFrames:
     starts: IntArray
     axes: FloatArray | None = None
 
-    SHAPES: ClassVar[Shapes] = {
-        "pixel": (2, "n"),
-        "r": (3, "n"),
-        "weight": ("n",),
-        "starts": ("k+1",),
-    }
+    SHAPES: ClassVar = """
+        2 n: pixel
+        3 n: r
+        n: weight
+        k+1: starts
+    """
 
     @classmethod
     def from_observations(cls, obs: Observations) -> StarFrames:

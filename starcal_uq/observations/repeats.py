@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval, polyvander, polyvander2d
 from numpy.typing import NDArray
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes, floats
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -79,7 +79,11 @@ class Fingerprints:
     xy_px: NDArray[np.float32]
     error_px: NDArray[np.float32]
 
-    SHAPES: ClassVar[Shapes] = {"sizes": ("k",), "xy_px": ("m", 2), "error_px": ("m",)}
+    SHAPES: ClassVar = """
+        k: sizes
+        m 2: xy_px
+        m: error_px
+    """
 
     @classmethod
     def of(

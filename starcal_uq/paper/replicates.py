@@ -30,7 +30,7 @@ from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import Seed, bounded, seed_of
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm
@@ -192,11 +192,13 @@ class Replicates(Shown, Saved):
 
     KIND = "starcal_uq replicates 1"
     FILE = "a set of replicates", Remedy("reproduce", purpose="to write it")
-    SHAPES: ClassVar[Shapes] = {
-        **{"methods": ("m",), "failures": ("m",), "replicate": ("n",), "crlb": ("n", "p")},
-        **dict.fromkeys(("estimates", "claimed", "classical"), ("m", "n", "p")),
-        **dict.fromkeys(("map_px", "map_arcsec", "reprojection_px"), ("m", "n")),
-    }
+    SHAPES: ClassVar = """
+        m: methods failures
+        n: replicate
+        n p: crlb
+        m n p: estimates claimed classical
+        m n: map_px map_arcsec reprojection_px
+    """
 
     @property
     def n_replicates(self) -> int:

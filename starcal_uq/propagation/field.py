@@ -36,7 +36,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.linear import root_diagonal
 
 if TYPE_CHECKING:
@@ -90,15 +90,16 @@ class FieldMap(Shown, Saved):
 
     KIND = ""
     FILE = "a field map", Remedy("propagate", (RUN,), {"force": True}, "to write it again")
-    SHAPES: ClassVar[Shapes] = {
-        **{"x_px": ("x",), "y_px": ("y",), "star_x_px": ("n",), "star_y_px": ("n",)},
-        **dict.fromkeys(("sigma_absolute_arcsec", "sigma_compensated_arcsec"), ("y", "x")),
-        **dict.fromkeys(("worst_absolute_arcsec", "worst_compensated_arcsec"), ("y", "x")),
-        **dict.fromkeys(
-            ("covariance_absolute_arcsec2", "covariance_compensated_arcsec2"), ("y", "x", 2, 2)
-        ),
-        **{"rotation_covariance_arcsec2": (3, 3), "equivalent_covariance_px2": (2, 2)},
-    }
+    SHAPES: ClassVar = """
+        x: x_px
+        y: y_px
+        n: star_x_px star_y_px
+        y x: sigma_absolute_arcsec sigma_compensated_arcsec worst_absolute_arcsec
+        y x: worst_compensated_arcsec
+        y x 2 2: covariance_absolute_arcsec2 covariance_compensated_arcsec2
+        3 3: rotation_covariance_arcsec2
+        2 2: equivalent_covariance_px2
+    """
 
     @property
     def equivalent_principal_point_px(self) -> FloatArray | None:

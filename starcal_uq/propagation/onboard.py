@@ -23,7 +23,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.provenance import Provenance
-from starcal_uq.core.types import FloatArray, IntArray, Shapes
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.maths.linear import scaled_inverse
@@ -67,7 +67,7 @@ class Extended:
     effects: Effects
     provenance: Provenance
 
-    SHAPES: ClassVar[Shapes] = {"covariance": ("p", "p")}
+    SHAPES: ClassVar = "p p: covariance"
 
     @property
     def mean(self) -> FloatArray:

@@ -26,7 +26,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import Seed, bounded
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.geometry import FrameGeometry
@@ -272,16 +272,15 @@ class ErrorSpectrum(Shown, Saved):
 
     KIND = "starcal_uq error spectrum 1"
     FILE = "an error spectrum", "compute it with error_spectrum"
-    SHAPES: ClassVar[Shapes] = {
-        **{
-            "frequency_hz": ("f",),
-            "psd_arcsec2_hz": ("f", 3),
-            "lag_s": ("l",),
-            "autocorrelation": ("l", 3),
-        },
-        **dict.fromkeys(("nea_psd_arcsec2_hz", "variance_arcsec2", "nea_arcsec"), (3,)),
-        **{"time_s": ("k",), "sigma_arcsec": ("k", 3)},
-    }
+    SHAPES: ClassVar = """
+        f: frequency_hz
+        f 3: psd_arcsec2_hz
+        l: lag_s
+        l 3: autocorrelation
+        3: nea_psd_arcsec2_hz variance_arcsec2 nea_arcsec
+        k: time_s
+        k 3: sigma_arcsec
+    """
 
     @property
     def axes(self) -> tuple[str, ...]:

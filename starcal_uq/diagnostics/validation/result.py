@@ -13,7 +13,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import CAMERA, Remedy
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.intervals import binomial_interval, holm
@@ -105,13 +105,12 @@ class Validation(Shown, Saved):
 
     KIND = "starcal_uq validation 1"
     FILE = "a validation", Remedy("validate", (CAMERA,), purpose="to write it")
-    SHAPES: ClassVar[Shapes] = {
-        **{"quantities": ("q",), "units": ("q",), "truth": ("n", "p+1")},
-        **dict.fromkeys(
-            ("replicate", "nees", "nees_calibration", "compression_error", "dof"), ("n",)
-        ),
-        **dict.fromkeys(("ranks", "covered", "error", "sd"), ("n", "q")),
-    }
+    SHAPES: ClassVar = """
+        q: quantities units
+        n p+1: truth
+        n: replicate nees nees_calibration compression_error dof
+        n q: ranks covered error sd
+    """
 
     def __post_init__(self) -> None:
         if self.n_ranked < 1:
