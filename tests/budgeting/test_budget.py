@@ -948,7 +948,11 @@ def test_json_is_all_that_the_tables_hold(stated: Path) -> None:
         rows = [{name: getattr(entry, name) for name in (*names, *more)} for entry in entries]
         return [
             {
-                key: None if isinstance(value, float) and math.isnan(value) else value
+                key: None
+                if isinstance(value, float) and math.isnan(value)
+                else list(value)
+                if isinstance(value, tuple)
+                else value
                 for key, value in row.items()
             }
             for row in rows
