@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +21,6 @@ from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    import pandas as pd
 
     from starcal_uq.calibration.screening.result import Screening
     from starcal_uq.camera.camera import Camera
@@ -191,11 +189,6 @@ def show_attitude(error: AttitudeError) -> None:
         print_table(onboard_table(error))
     if error.thermal is not None:
         print_table(thermal_table(error.thermal))
-
-
-def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:
-    """Chosen columns of a data frame, numbers with three digits; files and JSON have the rest."""
-    print_table(TextTable.of(frame, title, columns))
 
 
 def show_screening(screening: Screening) -> None:

@@ -59,39 +59,40 @@ def to_plain(
     result; without it they become lists. `null` writes what is not finite as None, because strict
     JSON has no other word for it, and `from_plain` reads NaN. TypeError for a value that no file of ours can hold.
     """
-    return _plain(record, "", arrays, apart, null)
 
+    def plain(value: Any, name: str) -> Any:
+        value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        if isinstance(value, Enum):
+            return value.name
+        if isinstance(value, float):
+            return None if null and not math.isfinite(value) else value
+        if value is None or isinstance(value, bool | int | str):
+            return value
+        if isinstance(value, list | tuple):
+            start = name.removesuffix("s")
+            return [plain(item, f"{start}{i}") for i, item in enumerate(value)]
+        if is_dataclass(value) and not isinstance(value, type):
+            # Both: a class that only tells itself in plain values, for readers, is read field by
+            # field.
+            own = getattr(value, "to_dict", None) if hasattr(value, "from_dict") else None
+            value = (
+                {f.name: getattr(value, f.name) for f in fields(value)} if own is None else own()
+            )
+        if not isinstance(value, Mapping):
+            raise TypeError(f"a file cannot hold {name or 'this'}: {type(value).__name__}")
+        kept: AnyDict = {}
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise TypeError(f"a file cannot hold the key {key!r} of {name}")
+            place = _below(name, key)
+            wanted = apart is None or key in apart or place in apart
+            if arrays is not None and wanted and isinstance(item, np.ndarray):
+                arrays[place] = item
+            else:
+                kept[key] = plain(item, place)
+        return kept
 
-def _plain(
-    value: Any, name: str, arrays: Arrays | None, apart: Collection[str] | None, null: bool
-) -> Any:
-    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-    if isinstance(value, Enum):
-        return value.name
-    if isinstance(value, float):
-        return None if null and not math.isfinite(value) else value
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, list | tuple):
-        start = name.removesuffix("s")
-        return [_plain(item, f"{start}{i}", arrays, apart, null) for i, item in enumerate(value)]
-    if is_dataclass(value) and not isinstance(value, type):
-        # Both: a class that only tells itself in plain values, for readers, is read field by field.
-        own = getattr(value, "to_dict", None) if hasattr(value, "from_dict") else None
-        value = {f.name: getattr(value, f.name) for f in fields(value)} if own is None else own()
-    if not isinstance(value, Mapping):
-        raise TypeError(f"a file cannot hold {name or 'this'}: {type(value).__name__}")
-    kept: AnyDict = {}
-    for key, item in value.items():
-        if not isinstance(key, str):
-            raise TypeError(f"a file cannot hold the key {key!r} of {name}")
-        place = _below(name, key)
-        wanted = apart is None or key in apart or place in apart
-        if arrays is not None and wanted and isinstance(item, np.ndarray):
-            arrays[place] = item
-        else:
-            kept[key] = _plain(item, place, arrays, apart, null)
-    return kept
+    return plain(record, "")
 
 
 def _below(name: str, key: str) -> str:

@@ -168,7 +168,7 @@ def _noise(cal: Calibration, shape: tuple[int, ...], rng: np.random.Generator) -
     if not cal.has_tails:
         return noise
     # The bivariate t of `likelihood.student`: r^2 / (nu + r^2) is Beta(1, nu / 2), in any direction.
-    nu = float(cal.provenance.student_t["dof"])
+    nu = cal.nu
     share = rng.beta(1.0, nu / 2.0, shape[-1])
     # Weights (nu + 2) / (nu + r^2) bound what is left.
     weights = "tail_weights" in cal.provenance

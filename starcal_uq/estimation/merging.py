@@ -278,12 +278,10 @@ def check_mergeable(
                 f"{names[0]}: merge with noise "
                 "'own', which states each run's noise."
             )
-        likelihood = cal.provenance.likelihood
-        if likelihood != "marginal":
+        if cal.has_tails:
             raise CalibrationError(
-                f"{name}: was calibrated with the likelihood {likelihood!r}, which does not add "
-                "up in compressed "
-                "form: calibrate it with the marginal likelihood, or calibrate all observations "
+                f"{name}: was calibrated with the likelihood 'student_t', which does not add up in "
+                "compressed form: calibrate it with the marginal likelihood, or calibrate all observations "
                 "together."
             )
         if fitted := cal.known_effects.fitted:

@@ -279,6 +279,11 @@ class Calibration(Deferring, Shown, Traced):
         return self.provenance.likelihood == "student_t"
 
     @property
+    def nu(self) -> float:
+        """Degrees of freedom of that Student t."""
+        return float(self.provenance.student_t["dof"])
+
+    @property
     def remedy(self) -> str:
         """Fault and remedy of a calibration that did not end well, in one clause."""
         return remedy_of(self.status, self.undetermined, self.camera.distortion, self.solver)

@@ -70,7 +70,7 @@ def gains(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> dict
         if tails:
             # Squares of Gaussian residuals that are as improbable as those of a Student t.
             assert cal.star_weights is not None
-            nu = float(cal.provenance.student_t["dof"])
+            nu = cal.nu
             squares = nu * np.log((nu + 2.0) / (nu * cal.star_weights))
         p = [*uneven_p(obs, cal.camera, squares, share), axes_p(likelihood, cal.theta)]
         chance = min(len(p) * min(p), 0.5)
@@ -86,7 +86,7 @@ def with_weighing(obs: Observations, cal: Calibration, noise: bool, tails: bool)
     """
     found: list[FittedEffect] = []
     stated = obs.unweighted.sigma_or_one
-    model, nu = cal.noise_model, float(cal.provenance.student_t["dof"]) if tails else None
+    model, nu = cal.noise_model, cal.nu if tails else None
     sigma_px = stated if model is None else model.sigma_px(obs)
     squares = np.sum(cal.residuals_px**2, axis=1)
     # Stars that cannot be in the field have no residual.

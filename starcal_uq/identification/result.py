@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 Parity: TypeAlias = Literal["normal", "mirrored"]
 FrameStatus: TypeAlias = Literal["identified", "not identified", "ambiguous", "too few stars"]
-STATUSES: tuple[FrameStatus, ...] = ("identified", "not identified", "ambiguous", "too few stars")
 
 
 @dataclass(frozen=True, eq=False)

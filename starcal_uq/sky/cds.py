@@ -10,7 +10,6 @@ import re
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from starcal_uq.core.files import unpack
 from starcal_uq.core.tables import RawTable
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, StrArray
 
-CdsFormat = Literal["hipparcos", "sao", "bsc"]
 LAYOUTS: dict[str, AnyDict] = tomllib.loads(
     (files(__package__) / "layouts.toml").read_text("utf-8")
 )

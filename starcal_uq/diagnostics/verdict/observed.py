@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -131,8 +132,7 @@ def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> Fi
     made = obs.origin.simulated or obs.origin.observer == "rendered"
     if found is None or made or not obs.origin.apparent:
         return None
-    facts = {"f_px": found.f_px, "f_sigma": found.f_sigma, "dated": found.dated}
-    return Finding(Note.RESTS_ON_ABERRATION, facts)
+    return Finding(Note.RESTS_ON_ABERRATION, asdict(found))
 
 
 def _of_air(obs: Observations, found: AirTest) -> Finding:
@@ -164,13 +164,7 @@ def _unsure(cal: Calibration, found: AirTest | None) -> tuple[Finding, ...]:
 
 def _of_times(obs: Observations, found: TimeTest) -> tuple[Finding, Remedies, tuple[Order, ...]]:
     """A time, or an epoch, that is not that of the stars: fact, remedies and orders."""
-    facts = {
-        "cause": found.cause,
-        "later": found.later,
-        "later_std": found.later_std,
-        "moves": found.moves,
-        "moves_sigma": found.moves_sigma,
-    }
+    facts = asdict(found)
     if found.cause == "hour":
         facts["east_deg"] = HOUR_DEG * found.later
     wrong, remedies = Finding(Note.WRONG_TIMES, facts), ()
