@@ -105,12 +105,14 @@ Code = Enum(
     """,
 )
 # The questions that checks help to answer; the others ask whether the result is trustworthy.
-_OF_THE_COMPUTATION = """
-    ESTIMATION TWO_ESTIMATORS OTHER_STARTS DATA_OF_THE_POSTERIOR R_HAT EFFECTIVE_DRAWS ACCEPTANCE
-    DERIVED_QUANTITIES DIGITS DEGREES_OF_FREEDOM BOUNDS
-    """
-_QUESTIONS = dict.fromkeys(_OF_THE_COMPUTATION.split(), Question.CONVERGED)
-_QUESTIONS["REQUIREMENT"] = Question.REQUIRED
+_OF_QUESTIONS = {
+    Question.CONVERGED: """
+        ESTIMATION TWO_ESTIMATORS OTHER_STARTS DATA_OF_THE_POSTERIOR R_HAT EFFECTIVE_DRAWS
+        ACCEPTANCE DERIVED_QUANTITIES DIGITS DEGREES_OF_FREEDOM BOUNDS
+    """,
+    Question.REQUIRED: "REQUIREMENT",
+}
+_QUESTIONS = {Code[name]: asked for asked, names in _OF_QUESTIONS.items() for name in names.split()}
 
 
 def title_of(code: Code) -> str:
@@ -252,7 +254,7 @@ class Check(Finding):
     @property
     def question(self) -> Question:
         """Question that the check answers."""
-        return _QUESTIONS.get(self.code.name, Question.TRUSTWORTHY)
+        return _QUESTIONS.get(self.code, Question.TRUSTWORTHY)
 
     @property
     def ways(self) -> tuple[tuple[str, bool], ...]:

@@ -179,12 +179,8 @@ def unseen_aberration(
 
     Parameters
     ----------
-    obs, cal
-        The data and the estimate made from them.
-    seed : int or Generator
-        Seed of the choice of frames, where there are many.
-    rest : Images, optional
-        What `remainder` gives for these, where it is known already.
+    obs, cal, seed, rest
+        As for `time_test`.
 
     Returns
     -------

@@ -95,8 +95,7 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     search = Search(settings.solver, settings.max_iterations)
-    made = {"method": settings.method, "solver": settings.solver}
-    refinement = None
+    made, refinement = settings.made, None
     if settings.method == "efficient":
         refinement = replace(search, tolerance=_gain(likelihood, _LAST_STEP), seen=False)
         # A solver and a limit of the iterations are those of every stage.
@@ -242,26 +241,25 @@ def _with_noise_model(
     nothing.
     """
     max_iterations = settings.max_iterations
-    if settings.tails:
-        refit = _with_tails(calibration, max_iterations)
-        model, _ = fit_noise(obs, calibration.camera, refit)
-        if model.varies:
-            weighted = obs.weighted(model.sigma_px(obs), model.axes)
-            calibration = _robust_fit(weighted, camera, settings)
-        return model, calibration
-    refit = without_tails(calibration.camera, max_iterations)
+    refit = (
+        _with_tails(calibration, max_iterations)
+        if settings.tails
+        else without_tails(calibration.camera, max_iterations)
+    )
     model, theta = fit_noise(obs, calibration.camera, refit)
-    if model.varies:
-        obs = obs.weighted(model.sigma_px(obs), model.axes)
-        likelihood = MarginalLikelihood(obs, camera.distortion)
-        # The estimate from interstar angles has no weights; its covariance and the refinement do.
-        search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
-        stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, search)]
-        pairs = PairObjective(likelihood.frames, camera.distortion)
-        estimate = partial(_pair_estimate, pairs, likelihood, stages)
-        made = {"method": settings.method, "solver": settings.solver}
-        calibration = assemble(obs, camera, likelihood, stages, stages[-1].status, estimate, made)
-    return model, calibration
+    if not model.varies:
+        return model, calibration
+    obs = obs.weighted(model.sigma_px(obs), model.axes)
+    if settings.tails:
+        return model, _robust_fit(obs, camera, settings)
+    likelihood = MarginalLikelihood(obs, camera.distortion)
+    # The estimate from interstar angles has no weights; its covariance and the refinement do.
+    search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
+    stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, search)]
+    pairs = PairObjective(likelihood.frames, camera.distortion)
+    estimate = partial(_pair_estimate, pairs, likelihood, stages)
+    made = settings.made
+    return model, assemble(obs, camera, likelihood, stages, stages[-1].status, estimate, made)
 
 
 def _with_tails(cal: Calibration, max_iterations: int) -> Refitting:

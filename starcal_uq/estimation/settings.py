@@ -20,7 +20,7 @@ from starcal_uq.core.settings import (
     effect_names,
     joined_effects,
 )
-from starcal_uq.core.types import PathLike
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.likelihood.student import parse_dof
 from starcal_uq.likelihood.ties import FixedMount
 
@@ -135,6 +135,11 @@ class EstimationSettings:
     def noise(self) -> bool:
         """True if the noise may vary from star to star."""
         return "noise" in self.names
+
+    @property
+    def made(self) -> AnyDict:
+        """What the provenance of a result states of them."""
+        return {"method": self.method, "solver": self.solver}
 
     @property
     def tails(self) -> bool:

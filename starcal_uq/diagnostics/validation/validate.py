@@ -58,19 +58,6 @@ _PRIOR_POINT_PX = 5.0
 _PRIOR_FOCAL = 1e-3
 _PRIOR_CORNER_PX = 1.0
 _PRIOR_LOG_SIGMA = 0.2
-# Fields of an outcome that become arrays of a validation.
-_ARRAYS = (
-    "replicate",
-    "truth",
-    "ranks",
-    "covered",
-    "error",
-    "sd",
-    "nees",
-    "nees_calibration",
-    "compression_error",
-    "dof",
-)
 
 
 @bounded
@@ -199,7 +186,7 @@ def validate_study(
         nominal=study.nominal,
         priors=study.priors,
         n_ranked=study.n_ranked,
-        **{name: np.array([getattr(o, name) for o in good]) for name in _ARRAYS},
+        **{name: np.array([getattr(o, name) for o in good]) for name in TrialOutcome._fields},
         failures=outcomes.failures,
         n_requested=n_replicates,
         interrupted=outcomes.interrupted,
