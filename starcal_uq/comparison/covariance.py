@@ -161,7 +161,7 @@ def is_efficient(result: Any) -> bool:
     diagnostics = getattr(result, "diagnostics", None)
     if diagnostics is not None:
         return bool(diagnostics.likelihood == "marginal")
-    return bool(result.method == "efficient" and not result.has_tails)
+    return bool(result.method == "efficient" and result.provenance.likelihood == "marginal")
 
 
 def _why_none(a: Any, b: Any, data: str) -> Basis:
