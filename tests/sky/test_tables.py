@@ -269,36 +269,24 @@ def test_readme_that_moved_a_column_is_followed(tmp_path: Path) -> None:
 
 
 def test_cds_errors_name_line_and_column(tmp_path: Path) -> None:
-    broken = HIPPARCOS[1].replace("+38.78299311", "+38.7829x311")
-    path = write(tmp_path, "hip_main.dat", ["", HIPPARCOS[0], broken])
-    with pytest.raises(
-        CatalogueError,
-        match=r"main\.dat, line 3, column 'DEICRS': '\+38\.7829x311' is not a number",
-    ):
-        read_catalogue(path)
-    far = HIPPARCOS[1].replace("+38.78299311", "+98.78299311")
-    with pytest.raises(CatalogueError, match=r"line 2, column 'DEICRS': 98\.783 deg is outside"):
-        read_catalogue(write(tmp_path, "hip_main.dat", [HIPPARCOS[0], far]))
+    first, second = HIPPARCOS[:2]
+    letter, far = (second.replace("+38.78299311", dec) for dec in ("+38.7829x311", "+98.78299311"))
     minute = bsc_line(7001, "186656.3", "+384701", " 0.03", "+0.202+0.286")
-    with pytest.raises(CatalogueError, match=r"line 1, column 'RAm': 66 is outside"):
-        read_catalogue(write(tmp_path, "catalog", [minute]))
-    with pytest.raises(CatalogueError):
-        read_catalogue(write(tmp_path, "catalog", ["  92 NOVA 1572"]))
-    with pytest.raises(CatalogueError):
-        read_catalogue(write(tmp_path, "sao.dat", [""]))
-    wrong = tmp_path / "ReadMe.bsc"
-    wrong.write_text(BSC_README)
-    with pytest.raises(
-        CatalogueError, match=r"ReadMe\.bsc: does not describe The Hipparcos Catalogue"
+    wrong = write(tmp_path, "ReadMe.bsc", [BSC_README])
+    for name, lines, options, said in (
+        ("hip_main.dat", ["", first, letter], {}, r"main.dat, line 3, column 'DEICRS': '.38.7829x"),
+        ("hip_main.dat", [first, far], {}, r"line 2, column 'DEICRS': 98\.783 deg is outside"),
+        ("catalog", [minute], {}, "line 1, column 'RAm': 66 is outside"),
+        ("catalog", ["  92 NOVA 1572"], {}, "no line holds a position"),
+        ("sao.dat", [""], {}, "is empty"),
+        ("hip_main.dat", HIPPARCOS, {"readme": wrong}, r"ReadMe\.bsc: does not describe The Hipp"),
+        ("hip_main.dat", HIPPARCOS, {"file_epoch": 2000.0}, "are fixed"),
     ):
-        read_catalogue(write(tmp_path, "hip_main.dat", HIPPARCOS), readme=wrong)
-    with pytest.raises(CatalogueError):
-        read_catalogue(write(tmp_path, "hip_main.dat", HIPPARCOS), file_epoch=2000.0)
+        with pytest.raises(CatalogueError, match=said):
+            read_catalogue(write(tmp_path, name, lines), **options)
     bad = tmp_path / "hip_main.dat.gz"
     bad.write_bytes(b"\x1f\x8b broken")
-    with pytest.raises(
-        CatalogueError, match=r"hip_main\.dat\.gz: is not readable as HIPPARCOS \(it ends too"
-    ):
+    with pytest.raises(CatalogueError, match="is not readable as HIPPARCOS"):
         read_catalogue(bad)
 
 
