@@ -50,7 +50,7 @@ _AXIS_NAMES = {
 _REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != "all"}
 # What the starter's names bring along, and nobody can guess for others.
 _OWN_KEYS = ("ecss_class", "interpretation", "absorbed_by_alignment")
-_OWN = Expected("", "other", "ensemble", "no", "gaussian", "")
+_OWN = Expected("", "other", "ensemble")
 # What a file may state by name alone.
 _STATED = (*FROM_FILE, *OF_EFFECTS.values())
 # Names as similar as this are one name mistyped.

@@ -8,11 +8,13 @@ calibration cannot know is in this list too, so that it is read as "not assessed
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from decimal import Decimal
+from pathlib import Path
 from typing import ClassVar
 
-from starcal_uq.core.constants import AXES, CROSS_BORESIGHT, INTERACTION
+from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.maths.intervals import HALF_WIDTH_997
 
 AXIS_LABELS = {
@@ -177,154 +179,20 @@ class Expected:
     name: str
     ecss_class: str
     interpretation: str
-    absorbed_by_alignment: str
-    distribution: str
-    what: str
+    absorbed_by_alignment: str = "no"
+    distribution: str = "gaussian"
+    what: str = ""
 
 
-FROM_POSTERIOR = (
-    Expected(
-        *(COMMON, "bias", "ensemble", "yes", "gaussian"),
-        "error of the camera parameters that turns all attitudes alike",
-    ),
-    Expected(
-        *(REST, "FOV spatial", "mixed", "no", "gaussian"),
-        "error of the camera parameters that depends on where the stars are",
-    ),
-    Expected(
-        *(NEA, "temporal noise (NEA)", "temporal", "no", "gaussian"),
-        "noise of the centroids",
-    ),
-)
-INTERACTING = Expected(
-    *(INTERACTION, "temporal noise (NEA)", "mixed", "no", "gaussian"),
-    "what is left when noise and calibration error act together",
-)
-# Present as long as nobody has tested the model: then its error is in the calibration rows.
-UNTESTED = Expected(
-    *("misfit of the camera model", "FOV spatial", "mixed", "no", "gaussian"),
-    "what the model of camera and noise cannot follow, as long as it was not tested",
-)
-# Rows that effects of the calibration fill, by effect; two of them are in every budget.
-OF_EFFECTS = {
-    "axes": Expected(
-        *("scale and skew of the axes", "FOV spatial", "mixed", "no", "gaussian"),
-        "pixels that are not square, a skewed detector",
-    ),
-    "field": Expected(
-        *("field error", "FOV spatial", "mixed", "no", "gaussian"),
-        "errors of the lens that keep their place in the field",
-    ),
-    "radial": Expected(
-        *("radial error of the lens", "FOV spatial", "mixed", "no", "gaussian"),
-        "distortion along the radius beyond the model",
-    ),
-    "frame": Expected(
-        *("frame-to-frame error", "temporal noise (NEA)", "temporal", "no", "gaussian"),
-        "scale and shears that every frame has by itself",
-    ),
-    "zenith": Expected(
-        *("refraction", "FOV spatial", "temporal", "no", "gaussian"),
-        "refraction that the directions of the stars lack, on the ground",
-    ),
-    "temperature": Expected(
-        *("thermo-elastic of the optics", "thermo-elastic", "mixed", "no", "gaussian"),
-        "change of focal length and principal point with the temperature",
-    ),
-    "time": Expected(
-        *("drift", "FOV spatial", "mixed", "no", "gaussian"),
-        "change of focal length and principal point over the time of the calibration",
-    ),
-    "epoch": Expected(
-        *("night-to-night change", "FOV spatial", "mixed", "no", "gaussian"),
-        "change of focal length and principal point to another night",
-    ),
-    "star": Expected(
-        *("star catalogue", "FOV spatial", "mixed", "no", "gaussian"),
-        "errors of catalogue positions: proper motion since epoch, parallax, double stars",
-    ),
-    "phase": Expected(
-        *("pixel spatial error", "pixel spatial", "mixed", "no", "gaussian"),
-        "centroid interpolation, photo-response and dark-signal non-uniformity, as far as the "
-        "calibration frames did "
-        "not hold it as noise",
-    ),
-    "magnitude": Expected(
-        *("shift with brightness", "FOV spatial", "mixed", "no", "gaussian"),
-        "shift of centroids, and change of scale, with the magnitude",
-    ),
-}
-FROM_FILE = (
-    Expected(
-        *("on-ground alignment measurement", "bias", "ensemble", "yes", "gaussian"),
-        (
-            "alignment of the sensor's frame with its mounting reference (cube, feet), as measured "
-            "before launch"
-        ),
-    ),
-    Expected(
-        *("launch and settling shift", "bias", "ensemble", "yes", "uniform"),
-        (
-            "change of that alignment from its measurement to the start of the mission: launch "
-            "loads, gravity, moisture"
-        ),
-    ),
-    Expected(
-        *(ALIGNMENT, "bias", "ensemble", "caused by it", "gaussian"),
-        "error of the in-flight estimate that replaces the rows it absorbs, if it is more than "
-        "noise of the frames on "
-        "which `propagate` aligns",
-    ),
-    Expected(
-        *("thermo-elastic distortion", "thermo-elastic", "temporal", "no", "arcsine"),
-        (
-            "motion of boresight against mounting reference with temperature and its gradients "
-            "over "
-            "orbit and season"
-        ),
-    ),
-    Expected(
-        *("drift of focal length and distortion", "FOV spatial", "ensemble", "no", "gaussian"),
-        "change of the camera since the calibration that no effect of it holds: temperature, "
-        "vacuum, ageing",
-    ),
-    Expected(
-        *("chromatic and asymmetric star images", "FOV spatial", "mixed", "no", "gaussian"),
-        (
-            "shift of centroids with star colour, field position and focus that no distortion "
-            "model "
-            "holds"
-        ),
-    ),
-    OF_EFFECTS["star"],
-    OF_EFFECTS["phase"],
-    Expected(
-        *("aberration residual", "aberration", "temporal", "no", "arcsine"),
-        (
-            "what the on-board correction of aberration leaves: velocity error, or the whole "
-            "effect "
-            "if it is not corrected"
-        ),
-    ),
-    Expected(
-        *("measurement date error", "measurement date", "temporal", "no", "uniform"),
-        "error of the time tag times the angular rate",
-    ),
-    Expected(
-        *("motion during exposure", "temporal noise (NEA)", "temporal", "no", "gaussian"),
-        (
-            "smear, jitter and rolling shutter at the mission's rates, beyond those of the "
-            "calibration frames"
-        ),
-    ),
-    Expected(
-        *("end-of-life noise", "temporal noise (NEA)", "temporal", "no", "gaussian"),
-        "growth of the noise with radiation dose, dark current, loss of transmission",
-    ),
-    Expected(
-        *("straylight, particles and false stars", "robustness", "temporal", "no", "gaussian"),
-        "added error at the exclusion angles and particle fluxes that the mission has to endure",
-    ),
+_DECLARED = tomllib.loads(Path(__file__).with_name("contributors.toml").read_text("utf-8"))
+FROM_POSTERIOR = tuple(Expected(**entry) for entry in _DECLARED["posterior"])
+INTERACTING = Expected(**_DECLARED["interacting"])
+UNTESTED = Expected(**_DECLARED["untested"])
+# By effect; two of them are in every budget.
+OF_EFFECTS = {effect: Expected(**entry) for effect, entry in _DECLARED["effects"].items()}
+FROM_FILE = tuple(
+    OF_EFFECTS[entry["effect"]] if "effect" in entry else Expected(**entry)
+    for entry in _DECLARED["file"]
 )
 
 
@@ -341,12 +209,5 @@ def confidence_text(confidence: float) -> str:
 
 def not_assessed(expected: Expected, axis: str) -> Contributor:
     """A row that says that nobody has put a number on it."""
-    return Contributor(
-        name=expected.name,
-        ecss_class=expected.ecss_class,
-        axis=axis,
-        distribution=expected.distribution,
-        interpretation=expected.interpretation,
-        absorbed_by_alignment=expected.absorbed_by_alignment,
-        conditions=expected.what,
-    )
+    entries = dict(vars(expected))
+    return Contributor(axis=axis, conditions=entries.pop("what"), **entries)

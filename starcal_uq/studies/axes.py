@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from starcal_uq.calibration.calibrate import METHODS
@@ -81,10 +83,6 @@ class Axis:
         return self.limit.wanted().replace("give", "write", 1)
 
 
-def _number(name: str, words: str, unit: str = "", base: Any = None, key: str = "") -> Axis:
-    return Axis(name, words, unit, KEYS[key or name], base=base)
-
-
 def planned_effects(settings: AnyMapping) -> PlannedEffects | None:
     """Effects of the calibration of a cell; None without any."""
     text = settings.get("effects", NO_EFFECTS)
@@ -99,45 +97,27 @@ def _check_effects(text: str) -> None:
         PlannedEffects.parsed(text)
 
 
+_DECLARED = tomllib.loads(Path(__file__).with_name("axes.toml").read_text("utf-8"))
+_COEFFICIENTS = {
+    name: {"words": c.description, "unit": c.unit, "limit": KEYS["coefficient"]}
+    for name, c in COEFFICIENTS.items()
+}
+_OF_NAMES: AnyDict = {
+    "distortion": {"choices": model_names(axes=True)},
+    "pointing": {"choices": POINTINGS},
+    "method": {"choices": METHODS},
+    "likelihood": {"choices": LIKELIHOODS},
+    "effects": {"parse": _check_effects},
+}
 AXES = {
-    axis.name: axis
-    for axis in (
-        _number("fov_deg", "field of view", "deg"),
-        _number("focal_mm", "focal length", "mm"),
-        _number("pixels", "detector's width", "px"),
-        _number("pixel_um", "pixel pitch", "um"),
-        _number("x0_offset_px", "offset of the principal point in x", "px"),
-        _number("y0_offset_px", "offset of the principal point in y", "px"),
-        Axis("distortion", "distortion model", "", choices=model_names(axes=True)),
-        _number("distortion_px", "distortion at the corner", "px"),
-        *(_number(name, c.description, c.unit, key="coefficient") for name, c in COEFFICIENTS.items()),
-        _number("max_mag", "magnitude limit", "mag", base=6.0),
-        _number("stars", "number of stars per frame", ""),
-        _number("frames", "number of frames", "", base=200),
-        _number("min_stars", "fewest stars of a frame", "", base=5),
-        Axis("pointing", "pointing", "", choices=POINTINGS, base="random"),
-        _number("sigma_px", "centroid noise", "px", base=0.05),
-        # Photon noise grows by 0.2, noise of the background by 0.4.
-        _number("noise_per_mag", "growth of the noise per magnitude", "dex", base=0.0),
-        _number("noise_mag", "magnitude of the stated noise", "mag", base=6.0),
-        _number("noise_floor_px", "noise of bright stars", "px", base=0.0),
-        _number("exposure_s", "exposure time", "s"),
-        _number("rate_deg_s", "rate across the boresight", "deg/s"),
-        _number("age_years", "age of the sensor", "a"),
-        _number("direction_mas", "errors of the stars' directions", "mas", base=0.0),
-        Axis("prior", "prior", base=FLAT),
-        Axis("method", "method", "", choices=METHODS, base="efficient"),
-        Axis("likelihood", "likelihood", "", choices=LIKELIHOODS, base="marginal"),
-        Axis("effects", "effects", parse=_check_effects),
-        _number("temperature_range_c", "range of temperatures", "K"),
-        _number("nights", "nights", ""),
-    )
-}  # fmt: skip
+    name: Axis(name, **{"limit": KEYS.get(name)} | _OF_NAMES.get(name, {}) | entry)
+    for name, entry in (_DECLARED["camera"] | _COEFFICIENTS | _DECLARED["observation"]).items()
+}
 # Axes that change the sensor of a study, and those that its noise takes the place of.
 SENSOR_AXES = ("exposure_s", "rate_deg_s", "age_years")
 NOISE_AXES = ("sigma_px", "noise_per_mag", "noise_mag", "noise_floor_px")
 # Axes that make another camera.
-CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
+CAMERA_AXES = (*_DECLARED["camera"], *COEFFICIENTS)
 # Both set the focal length; the coefficients and the size of the distortion both set the
 # distortion.
 EXCLUSIVE = (

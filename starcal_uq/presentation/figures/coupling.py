@@ -11,6 +11,7 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import symbol
+from starcal_uq.presentation.words.numbers import correlation_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,14 +114,3 @@ def heat_map(
         # Inside its cell: nothing for the layout to make room for.
         style.in_cell(ax, text, row, column, in_layout=False, **look)
     return image
-
-
-def correlation_text(value: float, diagonal: bool = False) -> str:
-    """Two decimals; three near one, because 0.99 and 0.999 differ by a factor of three in sigma."""
-    if diagonal:
-        return "1"
-    if abs(value) >= 0.99:
-        text = f"{np.clip(value, -0.9999, 0.9999):.{4 if abs(value) >= 0.999 else 3}f}"
-    else:
-        text = f"{value:.2f}"
-    return text.replace("-", "−") if float(text) != 0.0 else "0.00"

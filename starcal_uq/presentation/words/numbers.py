@@ -13,6 +13,7 @@ from starcal_uq.budgeting.rows import AXIS_LABELS
 from starcal_uq.camera.distortion import PARAMETERS
 from starcal_uq.core.formatting import (
     MINUS,
+    count,
     decimals_for,
     fixed,
     plural,
@@ -98,7 +99,7 @@ def bound(value: float, at_least: bool, n: int = 3) -> str:
     return ("≥ " if at_least else "") + significant(value, n)
 
 
-def axis_label(asked: Requirement) -> str:
+def requirement_axis(asked: Requirement) -> str:
     """Axis of a requirement, with its index and frame where these are not the usual ones."""
     label = AXIS_LABELS[asked.axis]
     if asked.frame != SENSOR:
@@ -158,3 +159,32 @@ def across_and_roll(angles: Sequence[float]) -> str:
     """Angles about the three axes: across the boresight, and in roll."""
     pitch, yaw, roll = angles
     return f"{significant(np.hypot(pitch, yaw))} / {significant(abs(roll))}"
+
+
+def correlation_text(value: float, diagonal: bool = False) -> str:
+    """Two decimals; three near one, because 0.99 and 0.999 differ by a factor of three in sigma."""
+    if diagonal:
+        return "1"
+    if abs(value) >= 0.99:
+        text = f"{np.clip(value, -0.9999, 0.9999):.{4 if abs(value) >= 0.999 else 3}f}"
+    else:
+        text = f"{value:.2f}"
+    return text.replace("-", MINUS) if float(text) != 0.0 else "0.00"
+
+
+def frames_needed(number: float) -> str:
+    """Frames that a target takes, where some number of them does it."""
+    return "never" if np.isinf(number) else count(int(np.ceil(number)))
+
+
+def ends(values: Any) -> tuple[float, float]:
+    """Least and most of what is finite."""
+    finite = values[np.isfinite(values)]
+    return float(finite.min()), float(finite.max())
+
+
+def sigma_or_size(logarithm: float, coupling: bool) -> str:
+    """A sigma by its logarithm, or the size of the correlation whose price in sigma has it."""
+    if coupling:
+        return correlation_text(float(np.sqrt(-np.expm1(-2.0 * logarithm))))
+    return significant(np.exp(logarithm))

@@ -40,8 +40,10 @@ from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.planning.open_distortion import AFTER_FRAMES
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words import numbers
+from starcal_uq.presentation.words import axes, numbers
+from starcal_uq.propagation.coupling import COUPLED
 from starcal_uq.propagation.onboard_error import with_cross
+from starcal_uq.studies.findings import place_of
 
 # Radii that differ by less than this over the open distortion hardly matter.
 LITTLE = 1.2
@@ -111,6 +113,7 @@ def _environment() -> jinja2.Environment:
     )
     own: dict[str, Callable[..., Any]] = {
         **functions(formatting),
+        **functions(axes),
         **functions(numbers),
         "all_finite": lambda values: bool(np.isfinite(values).all()),
         "some_finite": lambda values: bool(np.isfinite(values).any()),
@@ -119,6 +122,7 @@ def _environment() -> jinja2.Environment:
         "largest": lambda values: int(np.argmax(np.abs(values))),
         "exp": np.exp,
         "mean": np.mean,
+        "place_of": place_of,
         "median": np.median,
         "repr": repr,
         "spoken": lambda name: name.replace("_", " "),
@@ -134,6 +138,7 @@ def _environment() -> jinja2.Environment:
         "AXES": AXES,
         "AXIS_LABELS": AXIS_LABELS,
         "COMPRESSED_BOUND": COMPRESSED_BOUND,
+        "COUPLED": COUPLED,
         "CONFLICTS": (CONFLICT, WEAK),
         "DENSITY_SPREAD": DENSITY_SPREAD,
         "ENOUGH_REPLICATES": ENOUGH_REPLICATES,

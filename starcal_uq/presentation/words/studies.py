@@ -6,21 +6,20 @@ along every axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.camera.distortion import COEFFICIENTS, parameter_called
-from starcal_uq.core.formatting import count, percent, significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
-from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.axes import axis_label, axis_name, place, value_words
-from starcal_uq.presentation.words.sentences import say, table
-from starcal_uq.propagation.coupling import COUPLED, PART
+from starcal_uq.presentation.words.axes import axis_label, place, value_words
+from starcal_uq.presentation.words.numbers import correlation_text, frames_needed
+from starcal_uq.presentation.words.sentences import table, told
+from starcal_uq.propagation.coupling import PART
 from starcal_uq.studies.axes import EFFECT_AXES
 from starcal_uq.studies.findings import Curve, Pair, place_of
 
@@ -30,10 +29,6 @@ if TYPE_CHECKING:
 _COMMON, _REST = "Common [arcsec]", "Rest [arcsec]"
 # Properties of a lens and a catalogue, which a designer does not choose.
 _GIVEN = ("distortion_px", "direction_mas", *COEFFICIENTS)
-# What templates write axes, values and places with.
-_WRITTEN: AnyDict = {
-    one.__name__: one for one in (axis_label, correlation_text, place, value_words)
-}
 Forms = Mapping[str, Callable[[float], str]]
 
 
@@ -43,42 +38,33 @@ def dashed(pair: Pair) -> str:
 
 def study_text(study: Study) -> str:
     """The strongest coupling, and what changes correlations."""
-    sweep = study.sweep
-    if not sweep.ok.any():
-        return say("Study.empty")
-    pairs = sweep.coupled or sweep.pairs[:1]
-    if not pairs:
-        return say("Study.uncoupled")
-    axes = {cost.axis for pair in sweep.coupled for cost in pair.decoupling()}
-    return say(
-        "Study.coupled",
-        n_coupled=len(sweep.coupled),
-        n_pairs=len(sweep.pairs),
-        limit=COUPLED,
-        strongest=dashed(pairs[0]),
-        ends=(pairs[0].strongest, pairs[0].weakest),
-        form=correlation_text,
-        changing=[axis_name(axis) for axis in sweep.axes if axis in axes],
-    )
+    return told("study", study)
 
 
 def study_answer(study: Study) -> list[str]:
     """The whole answer, a sentence for every question."""
     sweep = study.sweep
-    if not sweep.ok.any():
+    if not study.ok.any():
         return [study_text(study)]
-    inflation = study.data["variance_inflation"][sweep.ok] ** 0.5
-    price = inflation.median("cell").to_series().dropna()
-    return [
-        study_text(study),
-        say("Study.weakest", **_weakest(study)),
-        say("Study.price", price=price.to_dict()),
-        say("Study.attitude", rest=_ends(sweep.frame_error), common=_ends(sweep.common_rotation)),
-        *best_axis(study),
-        *_targets(study),
-        *_simpler(study),
-        *_simulated(study),
-    ]
+    inflation = study.data["variance_inflation"][study.ok] ** 0.5
+    biases = {model: model_bias(study, model) for model in simpler_models(study)}
+    posteriors = None
+    if "posterior_sigma" in study.data:
+        ratio = (study.data["posterior_sigma"] / study.data["sigma"]).values[study.ok]
+        posteriors = np.nanquantile(ratio, (0.05, 0.5, 0.95))
+    answer = told(
+        "study_answer",
+        study,
+        **_weakest(study),
+        price=inflation.median("cell").to_series().dropna().to_dict(),
+        best=best_axis(study),
+        aims=_aims(study),
+        errors=sweep.over(sweep.frame_error),
+        simpler={model: sweep.over(bias) for model, bias in biases.items()},
+        looks=_coverage(study) if "covered_95" in study.data else [],
+        posteriors=posteriors,
+    )
+    return [study_text(study), *answer.splitlines()]
 
 
 def best_axis(study: Study) -> list[str]:
@@ -90,12 +76,7 @@ def best_axis(study: Study) -> list[str]:
     for curve in sorted(curves, key=lambda curve: curve.change):
         if curve.matters and curve.axis not in _GIVEN:
             chosen["sensitive" if curve.axis == EFFECT_AXES[0] else "best"] = curve
-    return [say(f"Study.{kind}", it=curve, **_WRITTEN) for kind, curve in chosen.items()]
-
-
-def _ends(values: Any) -> tuple[float, float]:
-    """Least and most of what is finite."""
-    return float(np.nanmin(values)), float(np.nanmax(values))
+    return [told(f"{kind}_axis", curve) for kind, curve in chosen.items()]
 
 
 def _weakest(study: Study) -> AnyDict:
@@ -104,48 +85,23 @@ def _weakest(study: Study) -> AnyDict:
     kinds, n = np.unique(parts, axis=0, return_counts=True)
     return {
         "names": list(compress(study.parameter_names, kinds[np.argmax(n)])),
-        "share": n.max() / len(parts),
+        "share_of_cells": n.max() / len(parts),
         "variance": np.median(study.data["weak_variance"].values[study.ok]),
     }
 
 
-def _targets(study: Study) -> Iterator[str]:
-    """Share of the places that meet each target, and the frames that it takes."""
-    goal = study.definition.target_arcsec
-    aims: list[Any] = (
-        [] if goal is None else [(None, goal, study.sweep.frame_error, study.frames_for(goal))]
-    )
+def _aims(study: Study) -> list[tuple[Any, ...]]:
+    """Each target with its parameter, if it is of one, the errors at all places, and the frames
+    that it takes there.
+    """
+    over, goal = study.sweep.over, study.definition.target_arcsec
+    aims: list[tuple[Any, ...]] = []
+    if goal is not None:
+        aims.append((None, goal, over(study.sweep.frame_error), over(study.frames_for(goal))))
     for name, target in study.definition.target_sigma.items():
-        sigma = study.values("sigma", parameter=name)
-        needed = study.values("frames_needed_sigma", parameter=name)
-        aims.append((parameter_called(name), target, sigma, needed))
-    for spec, target, found, cells in aims:
-        needed = study.sweep.over(cells).values
-        finite = needed[np.isfinite(needed)]
-        yield say(
-            "Study.target",
-            spec=spec,
-            target=target,
-            met=_share(study, found, target),
-            frames=[_frames(n) for n in _ends(finite)] if len(finite) else [],
-            never=int(np.isinf(needed).sum()),
-        )
-
-
-def _share(study: Study, found: FloatArray, limit: Any) -> str:
-    """At how many of its places a number stays below a limit."""
-    known = np.isfinite(found)
-    numbers, limits = (study.sweep.over(each) for each in (found, np.where(known, limit, np.nan)))
-    return f"{count(int((numbers <= limits).sum()))} of {count(int(numbers.notnull().sum()))}"
-
-
-def _simpler(study: Study) -> Iterator[str]:
-    """Share of the places where a simpler distortion model would do."""
-    for model in simpler_models(study):
-        bias = model_bias(study, model)
-        if np.isfinite(bias).any():
-            share = _share(study, bias, study.sweep.frame_error)
-            yield say("Study.simpler", model=model, share=share, left=_ends(study.sweep.over(bias)))
+        both = (study.values(of, parameter=name) for of in ("sigma", "frames_needed_sigma"))
+        aims.append((parameter_called(name), target, *map(over, both)))
+    return aims
 
 
 def simpler_models(study: Study) -> list[str]:
@@ -160,47 +116,35 @@ def model_bias(study: Study, simpler: str) -> FloatArray:
     return study.values("model_bias_attitude_arcsec", axis="cross", simpler=simpler)
 
 
-def _simulated(study: Study) -> list[str]:
-    """Coverage of the 95 % intervals of simulated cells, and their posteriors against forecasts."""
-    if "covered_95" not in study.data:
-        return []
+def _coverage(study: Study) -> list[tuple[str, AnyDict, float, bool]]:
+    """Share of the 95 % intervals of each parameter that hold the truth, over all cells and at each
+    way to estimate, and whether chance explains it.
+    """
     sweep = study.sweep
-    choices = [axis for axis in ("method", "likelihood", "prior") if axis in sweep.axes]
-    groups: list[AnyDict] = [{axis: value} for axis in choices for value in sweep.values[axis]]
-    looks = [(name, at) for at in ({}, *groups) for name in sweep.names]
+    ways = [axis for axis in ("method", "likelihood", "prior") if axis in sweep.axes]
+    places: list[AnyDict] = [{}, *({axis: one} for axis in ways for one in sweep.values[axis])]
+    found = []
     # One false alarm in a hundred studies, however many intervals are looked at.
-    level = 1.0 - 0.01 / len(looks)
-    rates, wrong = [], []
-    for name, at in looks:
-        covered = study.values("covered_95", parameter=name)
-        n, rate = (float(sweep.over(covered, of, [], at)) for of in ("count", "mean"))
-        if n:
-            words = f"{name} {percent(rate, 3)}{f' ({place(at)})' if at else ''}"
-            low, high = binomial_interval(round(n * rate), int(n), level)
-            rates += [] if at else [words]
-            wrong += [] if low <= 0.95 <= high else [words]
-    if not rates:
-        return []
-    answer = [say("Study.covered", rates=rates, wrong=wrong, n_cells=int(sweep.ok.sum()))]
-    if "posterior_sigma" in study.data:
-        ratio = (study.data["posterior_sigma"] / study.data["sigma"]).values[study.ok]
-        low, middle, high = np.nanquantile(ratio, (0.05, 0.5, 0.95))
-        answer.append(say("Study.posteriors", low=low, middle=middle, high=high))
-    return answer
+    level = 1.0 - 0.01 / (len(places) * len(sweep.names))
+    for at in places:
+        for name in sweep.names:
+            covered = study.values("covered_95", parameter=name)
+            n, rate = (float(sweep.over(covered, of, [], at)) for of in ("count", "mean"))
+            if n:
+                low, high = binomial_interval(round(n * rate), int(n), level)
+                found.append((name, at, rate, low <= 0.95 <= high))
+    return found
 
 
 def study_advice(study: Study) -> list[str]:
     """What a designer can do with the answer."""
-    if not study.ok.any():
-        return [say("Study.nothing_to_advise")]
-    pairs: dict[str, list[str]] = {}
-    for pair in study.sweep.coupled:
+    apart: dict[str, list[str]] = {}
+    for pair in study.sweep.coupled if study.ok.any() else ():
         # Where the pair is least coupled, if its sigmas are smaller there.
         costs = [cost for cost in pair.decoupling() if _pays(study, pair, cost)]
-        where = place({costs[0].axis: costs[0].values[costs[0].least]}) if costs else ""
-        pairs.setdefault(where, []).append(dashed(pair))
-    apart = (say("Study.apart", where=where, names=names) for where, names in pairs.items())
-    return [*apart, *_cheapest(study)]
+        where = place({cost.axis: cost.values[cost.least] for cost in costs[:1]})
+        apart.setdefault(where, []).append(dashed(pair))
+    return told("study_advice", study, apart=apart, cheapest=_cheapest(study)).splitlines()
 
 
 def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
@@ -218,33 +162,22 @@ def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
     return True
 
 
-def _cheapest(study: Study) -> list[str]:
-    """The fewest frames that keep the target whatever the lens is; the most to spare among them."""
+def _cheapest(study: Study) -> AnyDict | None:
+    """Where the fewest frames keep the target whatever the lens is, with the most to spare; nowhere
+    if no number does, None where frames were not varied for a target.
+    """
     target, sweep = study.definition.target_arcsec, study.sweep
-    if target is None or "frames" not in sweep.axes:
-        return []
+    if target is None or "frames" not in sweep.axes or not study.ok.any():
+        return None
     given = [axis for axis in sweep.axes if axis in ("distortion", *_GIVEN)]
     worst = sweep.over(sweep.frame_error).max(given, skipna=False)
-    kept = worst.where(worst <= target).dropna("frames", how="all")
-    if not kept.size:
-        return [say("Study.more_frames", target=target)]
-    fewest = kept.isel(frames=[0])
-    best = fewest.isel(fewest.argmin(list(fewest.dims)))
-    return [say("Study.fewest", target=target, where=place(place_of(best)))]
+    kept = worst.where(worst <= target).dropna("frames", how="all").isel(frames=slice(1))
+    return place_of(kept.isel(kept.argmin(list(kept.dims)))) if kept.size else {}
 
 
 def study_limits(study: Study) -> list[str]:
     """What was not assessed, and which cells failed."""
-    sweep = study.sweep
-    parts = []
-    if sweep.failures:
-        n, of = int((~sweep.ok).sum()), len(sweep.ok)
-        parts.append(say("Study.failed", n=n, of=of, failures=sweep.failures[:3]))
-    if sweep.drawn:
-        parts.append(say("Study.drawn", axes=[axis_name(axis) for axis in sweep.drawn]))
-    elif len(study.definition.seeds) == 1:
-        parts.append(say("Study.one_seed"))
-    return [*parts, say(f"Study.{study.definition.mode}")]
+    return told("study_limits", study).splitlines()
 
 
 def study_notes(study: Study) -> list[str]:
@@ -256,37 +189,23 @@ def study_tables(study: Study) -> list[TextTable]:
     """Coupled pairs, what changes them and the errors, and medians along every axis."""
     if not study.ok.any():
         return []
-    tables = [_pairs_table(study), _changes_table(study), _medians_table(study)]
-    return [table for table in tables if table.rows]
+    pairs = table("coupled", it=(*study.sweep.coupled, *study.sweep.turned))
+    return [each for each in (pairs, _changes(study), _medians(study)) if each.rows]
 
 
-def _pairs_table(study: Study) -> TextTable:
-    pairs = (*study.sweep.coupled, *study.sweep.turned)
-    return table("coupled", _WRITTEN | {"place_of": place_of}, it=pairs)
-
-
-def _changes_table(study: Study) -> TextTable:
+def _changes(study: Study) -> TextTable:
     """One row for every axis that changes a coupling, a sigma or an attitude error."""
-    changes: list[Any] = [
-        (dashed(p), cost, _size) for p in study.sweep.coupled for cost in p.decoupling()
+    found: list[Any] = [
+        (dashed(pair), cost, True) for pair in study.sweep.coupled for cost in pair.decoupling()
     ]
     for name, sigma in sigmas(study).items():
         curves = study.sweep.curves(np.log(sigma))
-        changes += [(name, curve, _sigma) for curve in curves if curve.matters]
-    columns = zip(*changes, strict=True) if changes else ((), (), ())
-    return table("changes", _WRITTEN, **dict(zip(("name", "it", "form"), columns, strict=True)))
+        found += [(name, curve, False) for curve in curves if curve.matters]
+    columns = zip(*found, strict=True) if found else ((), (), ())
+    return table("changes", **dict(zip(("name", "it", "coupling"), columns, strict=True)))
 
 
-def _size(cost: float) -> str:
-    """Size of the correlation that costs this."""
-    return correlation_text(float(np.sqrt(-np.expm1(-2.0 * cost))))
-
-
-def _sigma(logarithm: float) -> str:
-    return significant(np.exp(logarithm))
-
-
-def _medians_table(study: Study) -> TextTable:
+def _medians(study: Study) -> TextTable:
     """One row for every value of every axis, all else at its median."""
     import pandas as pd
 
@@ -295,12 +214,9 @@ def _medians_table(study: Study) -> TextTable:
     for axis in study.axes:
         values = study.sweep.values[axis]
         along = [axis_label(axis), *[""] * (len(values) - 1)]
-        part = {"Along": along, "Value": map(value_words, values)}
-        for head, numbers in columns.items():
-            part[head] = study.sweep.over(numbers, dims=[axis])
-        parts.append(pd.DataFrame(part))
-    title = "Medians over seeds and all other axes"
-    return TextTable.of(pd.concat(parts), title, formats=forms)
+        medians = {head: study.sweep.over(of, dims=[axis]) for head, of in columns.items()}
+        parts.append(pd.DataFrame({"Along": along, "Value": map(value_words, values)} | medians))
+    return TextTable.of(pd.concat(parts), "Medians over seeds and all other axes", formats=forms)
 
 
 def sigmas(study: Study) -> dict[str, FloatArray]:
@@ -316,22 +232,13 @@ def summary(study: Study) -> tuple[dict[str, FloatArray], Forms]:
     """What a row of a table shows of a cell: numbers (C,) by their heads, and how some are
     written.
     """
-    sweep = study.sweep
-    coupled = sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)
-    columns = {
-        dashed(pair): study.values(
-            "correlation", parameter=pair.names[0], parameter_2=pair.names[1]
-        )
-        for pair in coupled[:2]
-    }
+    pairs = study.sweep.coupled or study.sweep.pairs[:1]
+    coupled = sorted(pairs, key=lambda pair: -pair.mean_size)
+    columns = {dashed(pair): pair.correlation for pair in coupled[:2]}
     forms: dict[str, Callable[[float], str]] = dict.fromkeys(columns, correlation_text)
     columns["Price f"] = np.sqrt(study.values("variance_inflation", parameter="f"))
     columns |= sigmas(study)
     if (target := study.definition.target_arcsec) is not None:
         head = f"Frames for {target:g} arcsec"
-        columns[head], forms[head] = study.frames_for(target), _frames
+        columns[head], forms[head] = study.frames_for(target), frames_needed
     return columns, forms
-
-
-def _frames(value: float) -> str:
-    return "never" if np.isinf(value) else count(int(np.ceil(value)))
