@@ -14,12 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from starcal_uq.core.formatting import MINUS, pretty_unit, significant
+from starcal_uq.core.formatting import MINUS, significant
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from starcal_uq.camera.distortion import Parameter
 
 
 _LOOKS = {"r": 'class="n" style="text-align:right"', "l": 'style="text-align:left"'}
@@ -147,14 +145,6 @@ class TextTable:
             f"\\begin{{tabular}}{{{self.align}}}\n\\toprule\n{line(self.heads)}\n\\midrule\n{body}\n"
             "\\bottomrule\n\\end{tabular}"
         )
-
-
-def with_units(table: TextTable, specs: Sequence[Parameter]) -> TextTable:
-    """The table with a last column: the unit in which each parameter is printed."""
-    rows = tuple(
-        (*row, pretty_unit(spec.scaled_unit)) for row, spec in zip(table.rows, specs, strict=True)
-    )
-    return TextTable((*table.heads, "Unit"), rows, table.title, table.align + "l", table.marks)
 
 
 _TEX = {

@@ -21,7 +21,8 @@ from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page, template_environment
 from starcal_uq.presentation.pages.printing import pdf_bytes
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, tables
+from starcal_uq.presentation.words.budgeting import tables
+from starcal_uq.presentation.words.numbers import NOT_RESOLVED
 from starcal_uq.presentation.words.sentences import told
 from starcal_uq.propagation.attitude_error import NOT_ASSESSED
 

@@ -27,7 +27,7 @@ from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
-from starcal_uq.presentation.tables import TextTable, with_units
+from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import table
 
 if TYPE_CHECKING:
@@ -59,15 +59,21 @@ def parameter_rows(results: Results) -> list[Row]:
         prior, prior_sd = (of(post.parameter_names) for of in (post.priors.mean, post.priors.sd))
     if truth is not None:
         true[:-1], z[:-1] = truth.theta, truth_z(cal, truth, post)
-    numbers = np.stack([mean, sd, low, high, prior, prior_sd, start, true], axis=1)
-    found = []
-    for spec, one, z_value in zip(all_parameters(results), numbers, z, strict=True):
-        found.append((spec, spec.scaled_unit, z_value, *(one / spec.scale)))
-        if spec.name == "f" and cal.camera.pixel_um is not None:
-            found.append((spec, "mm", z_value, *(one / (1000.0 / cal.camera.pixel_um))))
-    names = ("spec", "unit", "z", "mean", "sd", "low", "high", "prior", "prior_sd", "start")
-    columns = dict(zip((*names, "known"), zip(*found, strict=True), strict=True))
-    rows = table("parameters", **columns).records
+    specs = all_parameters(results)
+    order, scale = np.arange(len(specs)), scales_of(specs)
+    units = [spec.scaled_unit for spec in specs]
+    if cal.camera.pixel_um is not None:
+        focal = cal.parameter_names.index("f")
+        order, scale = (
+            np.insert(of, focal + 1, value)
+            for of, value in ((order, focal), (scale, 1000.0 / cal.camera.pixel_um))
+        )
+        units.insert(focal + 1, "mm")
+    columns = {"mean": mean, "sd": sd, "low": low, "high": high, "start": start, "known": true}
+    columns |= {"prior": prior, "prior_sd": prior_sd}
+    scaled = {name: values[order] / scale for name, values in columns.items()}
+    shown = [specs[place] for place in order]
+    rows = table("parameters", spec=shown, unit=units, z=z[order], **scaled).records
     return [{**row, "symbol": symbol(row["name"])} for row in rows]
 
 
@@ -145,7 +151,7 @@ def pair_table(cal: Calibration) -> TextTable:
     """The paper's estimator beside the efficient one: its sigma and the price in precision."""
     specs = parameters(cal.camera.distortion)
     scale = scales_of(specs)
-    rows = table(
+    return table(
         "pairs",
         it=specs,
         theta=cal.pair_theta / scale,
@@ -153,7 +159,6 @@ def pair_table(cal: Calibration) -> TextTable:
         best=cal.theta / scale,
         least=cal.sigmas / scale,
     )
-    return with_units(rows, specs)
 
 
 def noise_table(cal: Calibration) -> TextTable | None:

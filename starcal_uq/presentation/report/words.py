@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.types import AnyMapping
+from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.observed import refraction
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.words.estimation import calibration_table
@@ -42,21 +42,20 @@ _PATHS = {"numpy": "NumPy", "numba": "compiled loops (Numba)"}
 def provenance_rows(results: Results) -> list[tuple[str, str]]:
     """What is needed to repeat the run."""
     cal = results.calibration
+    path = cal.provenance.kernels
+    rows: AnyDict = {
+        "Data, SHA-256": cal.data_hash_of(results.observations),
+        "Source of the data": results.observations.origin.source,
+        "Nominal camera": results.camera_changed,
+    }
     steps = {"Calibration": cal, "Sampling": results.posterior, "Diagnosis": results.diagnosis}
     made = {name: of.provenance for name, of in steps.items() if of is not None}
-    path = cal.provenance.kernels
-    rows: list[tuple[str, object]] = [
-        ("Data, SHA-256", cal.data_hash_of(results.observations)),
-        ("Source of the data", results.observations.origin.source),
-        ("Nominal camera", results.camera_changed),
-    ]
     for name, step in made.items():
-        rows.append((f"{name}, time", step.created_utc or "unknown"))
-        rows.append((f"{name}, seed", step.seed))
-        rows.append((f"{name}, settings", _settings_text(step.settings)))
-    rows.append(("Sums over stars", path and _PATHS[path]))
-    rows.append(("Versions", list(made.values())[-1].software()))
-    return [(name, str(value)) for name, value in rows if value not in (None, "")]
+        rows[f"{name}, time"] = step.created_utc or "unknown"
+        rows[f"{name}, seed"] = step.seed
+        rows[f"{name}, settings"] = _settings_text(step.settings)
+    rows |= {"Sums over stars": path and _PATHS[path], "Versions": step.software()}
+    return [(name, str(value)) for name, value in rows.items() if value not in (None, "")]
 
 
 def _settings_text(settings: AnyMapping) -> str:

@@ -4,12 +4,13 @@ validation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import Parameter
+from starcal_uq.camera.distortion import Parameter, scales_of
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
@@ -23,7 +24,7 @@ from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.maths.linear import root_diagonal
-from starcal_uq.presentation.tables import TextTable, with_units
+from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import table, told
 
 # Errors this far from one posterior standard deviation are said to be too narrow or too wide; a
@@ -45,35 +46,45 @@ def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
     return table("misfit", {"level": MISFIT_P, "brief": found_only}, it=found.tests)
 
 
-def _sigmas(covariances: Mapping[str, FloatArray], specs: Sequence[Parameter]) -> AnyDict:
-    """Sigmas in the units of `specs`, or in px units."""
-    scales = [spec.scale for spec in specs] or 1.0
-    return {name: root_diagonal(matrix) / scales for name, matrix in covariances.items()}
+def _sigmas(
+    of: str, specs: Sequence[Parameter], covariances: Iterable[FloatArray], /, **columns: Any
+) -> TextTable:
+    """A table with sigmas in the units of `specs`, or in px units."""
+    scales = scales_of(specs) if specs else 1.0
+    kinds = ("formal", "sandwich", "model", "jackknifed")
+    sigmas = {
+        kind: root_diagonal(matrix) / scales
+        for kind, matrix in zip(kinds, covariances, strict=False)
+    }
+    units = [spec.scaled_unit for spec in specs] or [""] * len(columns["ratio"])
+    return table(of, None, () if specs else ("Unit",), unit=units, **columns, **sigmas)
 
 
 def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTable:
     """One row per parameter; sigmas in the units of `specs`, or in px units."""
     low, high = found.expected()
-    covariances = {"formal": found.formal_covariance, "sandwich": found.sandwich_covariance}
-    rows = table(
+    return _sigmas(
         "jackknife",
+        specs,
+        (found.formal_covariance, found.sandwich_covariance),
         name=found.parameter_names,
-        **_sigmas(covariances, specs),
         ratio=found.ratio,
         low=low,
         high=high,
         jackknife=found.jackknife_ratio,
         p=found.p_values,
     )
-    return with_units(rows, specs) if specs else rows
 
 
 def star_table(found: StarTest, specs: Sequence[Parameter] = ()) -> TextTable:
     """One row per parameter: sigmas with the star as the unit of what is independent."""
-    kinds = ("formal", "model", "sandwich", "jackknife")
-    sigmas = _sigmas({kind: getattr(found, f"{kind}_covariance") for kind in kinds}, specs)
-    rows = table("stars", name=found.parameter_names, ratio=found.widening, **sigmas)
-    return with_units(rows, specs) if specs else rows
+    covariances = (
+        found.formal_covariance,
+        found.sandwich_covariance,
+        found.model_covariance,
+        found.jackknife_covariance,
+    )
+    return _sigmas("stars", specs, covariances, name=found.parameter_names, ratio=found.widening)
 
 
 def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fitted") -> TextTable:

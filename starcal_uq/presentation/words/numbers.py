@@ -23,10 +23,12 @@ from starcal_uq.core.formatting import (
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
+    from starcal_uq.budgeting.totals import Total
     from starcal_uq.planning.open_distortion import DistortionRange
     from starcal_uq.planning.planned import Need
     from starcal_uq.propagation.attitude_error import AttitudeError
 
+NOT_RESOLVED = "not resolved"
 # A number, or the least and the most of several.
 Number: TypeAlias = float | tuple[float, float]
 
@@ -97,6 +99,17 @@ def bound(value: float, at_least: bool, n: int = 3) -> str:
     if math.isnan(value):
         return NOT_ASSESSED
     return ("≥ " if at_least else "") + significant(value, n)
+
+
+def sampled(total: Total) -> str:
+    """The sampled bound of a total in arcsec, with the digits that its standard error leaves."""
+    if total.unresolved:
+        return NOT_RESOLVED
+    if math.isnan(total.sampled_arcsec):
+        return NOT_ASSESSED
+    digits = max(decimals_for(total.sampled_se_arcsec, 1), decimals_for(total.sampled_arcsec, 2))
+    digits = min(digits, decimals_for(total.sampled_arcsec, 3))
+    return ("≥ " if total.at_least else "") + fixed(total.sampled_arcsec, digits)
 
 
 def requirement_axis(asked: Requirement) -> str:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter, scales_of
-from starcal_uq.core.constants import AXES, INTERACTION
-from starcal_uq.core.formatting import (
-    fixed,
-    significant,
-)
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
+from starcal_uq.core.formatting import fixed, significant
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import table, told
 from starcal_uq.propagation.attitude_error import (
@@ -29,9 +24,6 @@ from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.onboard_error import with_cross
 from starcal_uq.propagation.spectrum import ErrorSpectrum
 from starcal_uq.propagation.thermal import ThermalError
-
-if TYPE_CHECKING:
-    pass
 
 
 def agreement_text(agreement: Agreement) -> str:
@@ -49,42 +41,33 @@ _NOTES = (
     "common rotation and rest together",
     "beyond the sum of both",
 )
-# Columns of 1 sigma, 95 % and 99.7 % by what they begin with.
-_GROUPS = {"sigma": "", "p95": "p95_", "p997": "p997_"}
+# 1 sigma, 95 % and 99.7 %.
+_GROUPS = ("sigma", "p95", "p997")
 
 
 def attitude_rows(error: AttitudeError, small: bool = True) -> list[AnyDict]:
     """Contributions to the attitude error by both their figures, once where these print alike: 1
     sigma, 95 % and 99.7 % for each axis, arcsec; with `small` the interaction is but bounded.
     """
-    kinds = {WITH_MISFIT_FOUND: "with_misfit_found", IF_MODEL_HOLDS: "if_model_holds"}
+    held = error.if_model_holds_arcsec, error.p95_arcsec, error.p997_arcsec
+    found = error.with_misfit_found_arcsec, *error.half_widths_with_misfit_found_arcsec
+    absorbed = error.to_dataframe()["absorbed_by_alignment"].iloc[:: len(TOTAL_AXES)]
     rows = []
-    groups = error.to_dataframe().groupby("contributor", sort=False)
-    for (contributor, group), note in zip(groups, _NOTES, strict=True):
-        name = str(contributor)
+    for place, (name, note) in enumerate(zip(CONTRIBUTORS, _NOTES, strict=True)):
         shown = _small if small and name == INTERACTION else significant
-        figures = []
-        for kind, column in kinds.items():
-            values = {
-                head: [shown(float(v)) for v in group[f"{start}{column}_arcsec"]]
-                for head, start in _GROUPS.items()
-            }
-            untested = kind == WITH_MISFIT_FOUND and error.misfit is None
-            figures.append({"name": kind, "untested": untested, **values})
-        found, held = figures
-        if not found["untested"] and all(found[head] == held[head] for head in _GROUPS):
-            figures = [{**held, "name": "both"}]
-        if group["if_model_holds_arcsec"].isna().any():
+        figures: list[AnyDict] = [
+            {head: [*map(shown, of[place])] for head, of in zip(_GROUPS, kind, strict=True)}
+            for kind in (found, held)
+        ]
+        if error.misfit is not None and figures[0] == figures[1]:
+            figures = [figures[1] | {"name": "both", "untested": False}]
+        else:
+            figures[0] |= {"name": WITH_MISFIT_FOUND, "untested": error.misfit is None}
+            figures[1] |= {"name": IF_MODEL_HOLDS, "untested": False}
+        if np.isnan(held[0][place]).any():
             note = "not sampled by the version that wrote this run"
-        rows.append(
-            {
-                "contributor": name,
-                "note": note,
-                "absorbed": str(group["absorbed_by_alignment"].iloc[0]),
-                "total": name == CONTRIBUTORS[3],
-                "figures": figures,
-            }
-        )
+        row = {"contributor": name, "note": note, "absorbed": absorbed.iloc[place]}
+        rows.append({**row, "total": name == CONTRIBUTORS[3], "figures": figures})
     return rows
 
 
@@ -104,14 +87,12 @@ def attitude_table(error: AttitudeError) -> TextTable:
     rows: list[tuple[str, ...]] = []
     for row in attitude_rows(error, small=False):
         figures = [figure for figure in row["figures"] if not figure["untested"]]
-        several = len(figures) > 1
+        ends = (row["contributor"], row["absorbed"])
+        if len(figures) > 1:
+            rows.append((ends[0], *[""] * 5, ends[1]))
         for figure in figures:
-            cells = (*figure["sigma"], figure["p95"][3])
-            rows.append((f"  {figure['name']}" if several else row["contributor"], *cells, ""))
-        if several:
-            rows.insert(-2, (row["contributor"], *[""] * 5, row["absorbed"]))
-        else:
-            rows[-1] = (*rows[-1][:-1], row["absorbed"])
+            name, absorbed = ends if len(figures) == 1 else (f"  {figure['name']}", "")
+            rows.append((name, *figure["sigma"], figure["p95"][3], absorbed))
     heads = ("contributor", *AXES, "across", "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")
@@ -121,33 +102,32 @@ def onboard_table(error: AttitudeError) -> TextTable:
     """The calibration's part by what the software aboard uses, one beside the other, and the share
     of every effect.
     """
-    rows = [
-        (part if own is error.variants[0] else "", own.onboard, *map(significant, values))
-        for part in (error.variants[0].parts if error.variants else {})
-        for own in error.variants
-        for values in [with_cross(own.parts[part]).tolist()]
-    ]
-    return TextTable(
-        ("part", "aboard", *AXES, "across"),
-        tuple(rows),
-        f"Calibration's part with effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}",
-        "llrrrr",
-    )
+    names = error.variants[0].parts if error.variants else {}
+    parts = {name: {own.onboard: own.parts[name] for own in error.variants} for name in names}
+    title = f"Calibration's part with effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}"
+    return _aboard(parts, title)
 
 
 def thermal_table(error: ThermalError) -> TextTable:
     """Root mean square and peak over the profile by what the software aboard uses."""
-    rows = tuple(
-        (name if own == "model" else "", own, *map(significant, with_cross(values).tolist()))
-        for name, *both in (
-            ("common rotation", error.model.common_arcsec, error.effects.common_arcsec),
-            ("rest, rms over the profile", error.model.rest_arcsec, error.effects.rest_arcsec),
-            ("rest, largest", error.peak_arcsec("model"), error.peak_arcsec("effects")),
-        )
-        for own, values in zip(("model", "effects"), both, strict=True)
-    )
+    kinds = {"model": error.model, "effects": error.effects}
+    parts = {
+        "common rotation": {kind: own.common_arcsec for kind, own in kinds.items()},
+        "rest, rms over the profile": {kind: own.rest_arcsec for kind, own in kinds.items()},
+        "rest, largest": {kind: error.peak_arcsec(kind) for kind in kinds},
+    }
     title = f"Temperature of the optics over {error.profile.name}, arcsec, 1 sigma"
-    return TextTable(("part", "aboard", *AXES, "across"), rows, title, "llrrrr")
+    return _aboard(parts, title)
+
+
+def _aboard(parts: Mapping[str, Mapping[str, FloatArray]], title: str) -> TextTable:
+    """Sigmas (3,) of parts of an error, by what the software aboard uses."""
+    rows = []
+    for part, by in parts.items():
+        for aboard, sigma in by.items():
+            rows.append((part, aboard, *map(significant, with_cross(sigma).tolist())))
+            part = ""
+    return TextTable(("part", "aboard", *AXES, "across"), tuple(rows), title, "llrrrr")
 
 
 def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextTable:
@@ -185,26 +165,24 @@ def field_table(field: FieldMap) -> TextTable:
     """Least, median and largest uncertainty over the detector, before and after the best rotation
     is removed.
     """
-    maps = (
-        ("absolute", field.sigma_absolute_arcsec, field.worst_absolute_arcsec),
-        ("best rotation removed", field.sigma_compensated_arcsec, field.worst_compensated_arcsec),
+    return table(
+        "field",
+        name=("absolute", "best rotation removed"),
+        sigma=(field.sigma_absolute_arcsec, field.sigma_compensated_arcsec),
+        worst=(field.worst_absolute_arcsec, field.worst_compensated_arcsec),
     )
-    found = [(np.min(s), np.median(s), np.max(s), np.max(worst)) for _, s, worst in maps]
-    return table("field", name=[name for name, *_ in maps], numbers=found)
 
 
 def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:
     """One row per axis."""
-    rows = pd.DataFrame(
-        {
-            "axis": AXES,
-            "frame-dependent part [arcsec]": spectrum.rest_arcsec,
-            "correlation time [s]": spectrum.correlation_time_s,
-            "centroid noise of a frame [arcsec]": spectrum.nea_arcsec,
-            "exceeds averaged noise after [s]": spectrum.dominates_after_s,
-        }
+    return table(
+        "spectrum",
+        axis=AXES,
+        rest=spectrum.rest_arcsec,
+        time=spectrum.correlation_time_s,
+        noise=spectrum.nea_arcsec,
+        after=spectrum.dominates_after_s,
     )
-    return TextTable.of(rows, missing="not known")
 
 
 def attitude_notes(error: AttitudeError) -> list[str]:

@@ -55,6 +55,8 @@ SCOPE_NAMES = {
 }
 
 
+# In place of the pilcrows of templates: texts that people write may hold these.
+_END = "\x1e"
 # What an entry for a table has beside the cells of its columns.
 _OF_TABLES = ("title", "align", "mark")
 
@@ -93,8 +95,8 @@ def templates() -> dict[str, str]:
         if kind == "Table":
             cells = {head: text for head, text in entry.items() if head not in _OF_TABLES}
             parts = [entry.get("mark", ""), *cells.values()]
-            found[f"Heads.{table}"] = "¶".join([entry.get("title", ""), *cells])
-        found[name] = "¶".join(parts)
+            found[f"Heads.{table}"] = _END.join([entry.get("title", ""), *cells])
+        found[name] = "¶".join(parts).replace("¶", _END)
     return found
 
 
@@ -153,7 +155,7 @@ def _environment() -> jinja2.Environment:
 
 
 def _lines(name: str, facts: AnyMapping) -> list[str]:
-    lines = _environment().get_template(name).render(facts).split("¶")
+    lines = _environment().get_template(name).render(facts).split(_END)
     return [re.sub("[ \n]+", " ", line).strip(" ") for line in lines]
 
 
