@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,6 +36,7 @@ from starcal_uq.budgeting.rows import (
     UNTESTED,
     Contributor,
     Expected,
+    Remark,
     not_assessed,
 )
 from starcal_uq.budgeting.sampling import N_SAMPLES
@@ -62,8 +62,6 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.thermal import TemperatureProfile
 
 _CONFIDENCE = 0.997
-# What to know of the rows.
-Remark = Enum("Remark", "REPLACED TWICE NOT_ASSESSED IN_PART OF_HEADS WEIGHTS")
 # A row of the file that may hold what effects fill rows with.
 _DRIFT = "drift of focal length and distortion"
 _OF_TIME_OR_WARMTH = [OF_EFFECTS[name].name for name in ("temperature", "time", "epoch")]

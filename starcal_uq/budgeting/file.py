@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +36,7 @@ from starcal_uq.core.errors import BudgetError, SensorError
 from starcal_uq.core.files import listed
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import KEYS
-from starcal_uq.core.toml import Key, Section, read_toml
+from starcal_uq.core.toml import Key, Section, keys_of, read_toml
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, PathLike
 from starcal_uq.simulation.sensor import Sensor
 
@@ -57,76 +58,45 @@ _STATED = (*FROM_FILE, *OF_EFFECTS.values())
 _SAME_NAME = 0.9
 JUDGED_BY = ("both", "rule", "sampling")
 
-# What may stand in the tables; no error is larger than a full turn.
-_TURN = 1_296_000.0
-_TEXT = Key(str, "text in quotes")
-_NAME = Key(str, "text in quotes", required=True, pattern=r"\S")
-_SIZE = Key(float, f"a number of arcsec from 0 to {_TURN:.0f}, a full turn", ge=0.0, le=_TURN)
-_CONFIDENCE = Key(float, "a share between 0 and 1, such as 0.997", lt=1e9)
-_SECONDS = Key(float, "a positive number of seconds, at most 1e10", gt=0.0, le=1e10)
-_RATE = Key(float, "a rate from 0 to 360, in degrees per second", ge=0.0, le=360.0)
-BUDGET_KEYS = {
-    "title": _TEXT,
-    "confidence": _CONFIDENCE,
-    "frame_seconds": _SECONDS,
-    "rate_deg_s": _RATE,
-    "sensor": _TEXT,
+# What may stand in the tables, but for words of a list.
+_KEYS = {
+    name: keys_of(table)
+    for name, table in tomllib.loads(
+        Path(__file__).with_name("keys.toml").read_text("utf-8")
+    ).items()
 }
-# Title block of the budget to sign.
-DOCUMENT_KEYS = dict.fromkeys(
-    ("project", "number", "issue", "prepared", "checked", "approved"), _TEXT
-)
-_BEHAVIOUR_KEYS = {
-    key: _SECONDS if key.endswith("_seconds") else _TEXT for key in TIME_KEYS.values()
-}
-_TIMES = {"window_seconds": _SECONDS, "stability_seconds": _SECONDS}
+BUDGET_KEYS = _KEYS["budget"]
 CONTRIBUTOR_KEYS = {
-    "name": _NAME,
+    **_KEYS["contributor"],
     "ecss_class": Key.choice(ECSS_CLASSES),
     "axis": Key.choice(tuple(_AXIS_NAMES), required=True),
-    "mean_arcsec": Key(
-        float, f"a number of arcsec, at most {_TURN:.0f}, a full turn", ge=-_TURN, le=_TURN
-    ),
-    "sigma_arcsec": _SIZE,
-    "half_width_arcsec": _SIZE,
     "distribution": Key.choice(DISTRIBUTIONS),
     "interpretation": Key.choice(INTERPRETATIONS),
     "absorbed_by_alignment": Key.choice(ABSORBED),
-    "correlation_group": _TEXT,
-    "conditions": _TEXT,
-    "provenance": Key(
-        str, "where the number is from, because a budget is signed", required=True, pattern=r"\S"
-    ),
-    "applies": Key(bool, "true or false, without quotes"),
     "part": Key.choice(PARTS),
-    **_BEHAVIOUR_KEYS,
+    **_KEYS["behaviour"],
 }
-BEHAVIOUR_KEYS = {"name": _NAME, "axis": Key.choice(tuple(_AXIS_NAMES)), **_BEHAVIOUR_KEYS}
-INDEX_KEYS = {"kind": Key.choice(NAMES, required=True), **_TIMES}
+BEHAVIOUR_KEYS = {
+    "name": _KEYS["contributor"]["name"],
+    "axis": Key.choice(tuple(_AXIS_NAMES)),
+    **_KEYS["behaviour"],
+}
+INDEX_KEYS = {"kind": Key.choice(NAMES, required=True), **_KEYS["times"]}
 REQUIREMENT_KEYS = {
-    "name": _NAME,
+    **_KEYS["requirement"],
     "axis": Key.choice(tuple(_REQUIREMENT_AXES), required=True),
-    "limit_arcsec": Key(
-        float,
-        f"a positive number of arcsec, at most {_TURN:.0f}, a full turn",
-        required=True,
-        gt=0.0,
-        le=_TURN,
-    ),
-    "confidence": _CONFIDENCE,
     "scope": Key.choice(SCOPES),
     "interpretation": Key.choice(INTERPRETATIONS),
     "judged_by": Key.choice(JUDGED_BY),
-    "frame": _TEXT,
     "index": Key.choice(NAMES),
-    **_TIMES,
+    **_KEYS["times"],
 }
 SENSOR = "sensor"
 _FRAME = Section({"rotation": ROTATION}, BudgetError)
 _HEAD, _DOCUMENT, _CONTRIBUTOR, _REQUIREMENT, _BEHAVIOUR, _INDEX = (
     Section(keys, BudgetError)
     for keys in (
-        *(BUDGET_KEYS, DOCUMENT_KEYS, CONTRIBUTOR_KEYS),
+        *(BUDGET_KEYS, _KEYS["document"], CONTRIBUTOR_KEYS),
         *(REQUIREMENT_KEYS, BEHAVIOUR_KEYS, INDEX_KEYS),
     )
 )
@@ -536,6 +506,6 @@ def _requirement(data: Any, where: str, confidence: float, frames: tuple[str, ..
     asked = Requirement(
         axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0], **table
     )
-    times = {name: table[name] for name in _TIMES if name in table}
+    times = {name: table[name] for name in _KEYS["times"] if name in table}
     _index({"kind": asked.index, **times}, where)
     return asked

@@ -20,11 +20,11 @@ import numpy as np
 
 from starcal_uq.attitude.heads import HeadArray, load_heads
 from starcal_uq.budgeting.behaviour import Behaviour
-from starcal_uq.budgeting.budget import Remark, combination, confidence_of, from_file, row_notes
+from starcal_uq.budgeting.budget import combination, confidence_of, from_file, row_notes
 from starcal_uq.budgeting.file import BudgetFile, load_budget_file
 from starcal_uq.budgeting.posterior import axis_correlations
 from starcal_uq.budgeting.result import Budget, by_contributor
-from starcal_uq.budgeting.rows import NEA, Contributor
+from starcal_uq.budgeting.rows import NEA, Contributor, Remark
 from starcal_uq.budgeting.sampling import N_SAMPLES
 from starcal_uq.budgeting.totals import covariance
 from starcal_uq.core.constants import AXES

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,18 +23,14 @@ from starcal_uq.budgeting.rows import (
     REST,
     Contributor,
     Expected,
+    Remark,
     not_assessed,
 )
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import join_words, percent, plural, significant
-from starcal_uq.core.remedy import RUN, Remedy
+from starcal_uq.core.findings import clause
 from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.linear import root_diagonal
-from starcal_uq.propagation.attitude_error import (
-    CONTRIBUTORS,
-    IF_MODEL_HOLDS,
-    WITH_MISFIT_FOUND,
-)
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS
 from starcal_uq.propagation.onboard_error import OnboardError, with_cross
 from starcal_uq.propagation.thermal import TEMPERATURE
 
@@ -42,12 +38,12 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.onboard_error import EffectError
-    from starcal_uq.propagation.thermal import ThermalError
 
 # What alignment takes up of an effect is a row of its own.
 _IN_COMMON = ", common rotation"
 # What is below this is rounding, arcsec.
 _NOTHING_ARCSEC = 1e-9
+_ZERO = np.zeros(3)
 
 
 def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributor, ...]:
@@ -58,12 +54,9 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     noise alone: effects have rows of their own.
     """
     attitude = without_effects(attitude)
-    hash_text = (post.provenance.data_sha256 or "")[:12]
-    provenance = f"posterior of {plural(len(post.draws), 'draw')}" + (
-        f", data {hash_text}" if hash_text else ""
+    provenance = clause(
+        Remark.OF_DRAWS, draws=len(post.draws), sha256=post.provenance.data_sha256 or ""
     )
-    conditions = f"star geometry of {plural(attitude.n_frames, 'frame')} ({attitude.frames}), "
-    conditions += f"{post.camera.distortion} distortion"
     expected = list(FROM_POSTERIOR)
     if np.all(np.isfinite(attitude.interaction_arcsec)):
         expected.append(INTERACTING)
@@ -80,8 +73,13 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
         scale = np.divide(held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
         scale = np.minimum(scale, 1.0)
         correlation = axis_correlations(attitude.covariance_arcsec2[place], scale)
-        alignment = f"; alignment on {attitude.alignment}" if entry.name == COMMON else ""
-        asked = f"; with effects ({names})" if names and entry.name in (COMMON, REST) else ""
+        conditions = clause(
+            Remark.OF_FRAMES,
+            attitude=attitude,
+            distortion=post.camera.distortion,
+            effects=names if entry.name in (COMMON, REST) else [],
+            aligned=entry.name == COMMON,
+        )
         for index, axis in enumerate(AXES):
             # What effects add has no frame-by-frame sigma: the excess of the tail shrinks with its
             # share.
@@ -102,7 +100,7 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
                     absorbed_by_alignment=entry.absorbed_by_alignment,
                     axis_correlation=correlation[index],
                     tail_997=GAUSSIAN_997 + float(share) * excess,
-                    conditions=conditions + asked + alignment,
+                    conditions=conditions,
                     provenance=provenance,
                     source="posterior",
                     if_model_holds_arcsec=float(held[index]),
@@ -181,9 +179,14 @@ def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
     """The rest of an effect, and what is in common; of frames by themselves nothing is."""
     expected = OF_EFFECTS[share.name]
     thermal = attitude.thermal if share.name == TEMPERATURE else None
-    told = _conditions(attitude, thermal)
+    told = clause(Remark.OF_EFFECT, attitude=attitude, thermal=thermal)
     constant = share.rest_constant_arcsec**2 > 0.5 * np.diag(share.rest_covariance_arcsec2)
-    rest = _of_axes(expected, share.rest_mean_arcsec, share.rest_covariance_arcsec2, told)
+    entries = {
+        "conditions": told,
+        "provenance": "effect of the calibration, propagated with the posterior",
+        "source": "posterior",
+    }
+    rest = of_axes(expected, share.rest_covariance_arcsec2, share.rest_mean_arcsec, **entries)
     for index, row in enumerate(rest):
         if constant[index]:
             rest[index] = replace(row, interpretation="ensemble")
@@ -191,7 +194,7 @@ def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
             # A short peak of the temperature is beyond what the root mean square says.
             peak = float(thermal.peak_arcsec(attitude.onboard)[index])
             tail = (peak - abs(row.mean_arcsec)) / row.sigma_arcsec
-            words = f"{told}, largest error {significant(peak)} arcsec"
+            words = clause(Remark.PEAK, told=told, peak_arcsec=peak)
             rest[index] = replace(row, conditions=words, tail_997=max(GAUSSIAN_997, tail))
     common = []
     if share.name != "frame" and share.common_arcsec.max() > _NOTHING_ARCSEC:
@@ -203,38 +206,23 @@ def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
             # Alignment and mission may have different nights.
             absorbed_by_alignment="in part" if share.name == "epoch" else "yes",
         )
-        common = _of_axes(shared, share.common_mean_arcsec, share.common_covariance_arcsec2, told)
+        matrix, mean = share.common_covariance_arcsec2, share.common_mean_arcsec
+        common = of_axes(shared, matrix, mean, **entries)
     tested = attitude.misfit is not None
     return [
-        replace(row, with_misfit_found_arcsec=row.sigma_arcsec if tested else math.nan)
+        replace(
+            row,
+            if_model_holds_arcsec=row.sigma_arcsec,
+            with_misfit_found_arcsec=row.sigma_arcsec if tested else math.nan,
+        )
         for row in common + rest
     ]
 
 
-def _conditions(attitude: AttitudeError, thermal: ThermalError | None) -> str:
-    """Frames, what the software uses, and the temperatures."""
-    uses = "the camera's parameters alone" if attitude.onboard == "model" else "the effect as well"
-    words = (
-        f"star geometry of {plural(attitude.n_frames, 'frame')} ({attitude.frames}); the software "
-        f"uses {uses}"
-    )
-    if thermal is None:
-        return words
-    outside = (
-        f", {percent(thermal.outside_share)} of the time outside of those of the calibration"
-        if thermal.outside.any()
-        else ""
-    )
-    return (
-        f"{words}; temperatures of {thermal.profile.name}{outside}, alignment at "
-        f"{thermal.aligned_c:.1f} degC"
-    )
-
-
-def _of_axes(
-    expected: Expected, mean: FloatArray, covariance: FloatArray, conditions: str
+def of_axes(
+    expected: Expected, covariance: FloatArray, mean: FloatArray = _ZERO, **entries: Any
 ) -> list[Contributor]:
-    """A row on three axes from means (3,) and covariance (3, 3), arcsec."""
+    """A row on three axes from covariance (3, 3) and means (3,), arcsec, with other entries."""
     sigma = root_diagonal(covariance)
     correlations = axis_correlations(covariance, np.ones(3))
     return [
@@ -243,10 +231,7 @@ def _of_axes(
             mean_arcsec=float(mean[index]),
             sigma_arcsec=float(sigma[index]),
             axis_correlation=correlations[index],
-            conditions=conditions,
-            provenance="effect of the calibration, propagated with the posterior",
-            source="posterior",
-            if_model_holds_arcsec=float(sigma[index]),
+            **entries,
         )
         for index, axis in enumerate(AXES)
     ]
@@ -283,26 +268,15 @@ def stated_instead(
 def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
     """What the tests of the model did to the rows, in sentences."""
     if attitude.misfit is None:
-        return (
-            "The model was not tested, or what was found could not be fitted: the calibration rows "
-            f"hold {IF_MODEL_HOLDS}, and what they are {WITH_MISFIT_FOUND} is not assessed "
-            f"({Remedy('diagnose', (RUN,))}).",
-        )
-    if names := _effects(attitude):
-        return (
-            f"The data support effects ({names}): {COMMON!r} and {REST!r} are errors of the calibrated camera "
-            "if the one with these effects is right.",
-        )
-    return (
-        "The tests of the model support no further effects; what they cannot see is in no row.",
-    )
+        return (clause(Remark.UNTESTED),)
+    return (clause(Remark.SUPPORTED, effects=_effects(attitude), common=COMMON, rest=REST),)
 
 
-def _effects(attitude: AttitudeError) -> str:
-    """The effects that the calibration lacks and its data support; empty where there are none."""
+def _effects(attitude: AttitudeError) -> list[str]:
+    """The effects that the calibration lacks and its data support."""
     if attitude.misfit is None or attitude.variants:
-        return ""
-    return join_words([effect.name for effect in attitude.misfit.effects])
+        return []
+    return [effect.name for effect in attitude.misfit.effects]
 
 
 def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:
@@ -324,20 +298,12 @@ def alignment_rows(attitude: AttitudeError) -> tuple[Contributor, ...]:
     state another.
     """
     expected = next(entry for entry in FROM_FILE if entry.name == ALIGNMENT)
-    correlations = axis_correlations(attitude.alignment_covariance_arcsec2, np.ones(3))
-    rows = (
-        replace(
-            not_assessed(expected, axis),
-            mean_arcsec=0.0,
-            sigma_arcsec=float(sigma),
-            axis_correlation=correlation,
-            conditions=f"noise of {attitude.alignment}, reference attitude without error",
-            provenance="propagated with the posterior",
-            source="posterior",
-        )
-        for axis, sigma, correlation in zip(
-            AXES, attitude.alignment_arcsec, correlations, strict=True
-        )
+    rows = of_axes(
+        expected,
+        attitude.alignment_covariance_arcsec2,
+        conditions=f"noise of {attitude.alignment}, reference attitude without error",
+        provenance="propagated with the posterior",
+        source="posterior",
     )
     return tuple(row for row in rows if math.isfinite(row.sigma_arcsec))
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from decimal import Decimal
+from enum import Enum
 from pathlib import Path
 from typing import ClassVar
 
@@ -49,6 +50,14 @@ ALIGNMENT = "alignment calibration in flight"
 _NAN = float("nan")
 # Two-sided 99.7 % quantile of a Gaussian error, standard deviations.
 GAUSSIAN_997 = HALF_WIDTH_997
+
+
+# What to know of the rows, under what conditions they hold, and where their numbers are from.
+Remark = Enum(
+    "Remark",
+    "REPLACED TWICE NOT_ASSESSED IN_PART OF_HEADS WEIGHTS UNTESTED SUPPORTED OF_DRAWS OF_FRAMES"
+    " OF_EFFECT PEAK OF_SENSOR",
+)
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.budgeting.posterior import axis_correlations
-from starcal_uq.budgeting.rows import FROM_FILE, Contributor, not_assessed
-from starcal_uq.core.constants import ARCSEC, AXES
+from starcal_uq.budgeting.posterior import of_axes
+from starcal_uq.budgeting.rows import FROM_FILE, Contributor, Remark
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import BudgetError
-from starcal_uq.core.formatting import plural, significant
+from starcal_uq.core.findings import clause
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import root_diagonal
@@ -57,33 +57,23 @@ def sensor_rows(
     if new == still and sensor == new:
         return ()
     before, moving, old = (noise_covariance(one, camera, frames) for one in (still, new, sensor))
-    added = {}
-    if new != still:
-        conditions = f"at {sensor.rate_deg_s:g} degrees per second"
-        added[MOTION] = (moving - before, conditions)
-    if sensor != new:
-        added[END_OF_LIFE] = (old - moving, f"after {sensor.age_years:g} years")
+    added = {MOTION: moving - before, END_OF_LIFE: old - moving}
+    if new == still:
+        del added[MOTION]
+    if sensor == new:
+        del added[END_OF_LIFE]
     expected = {entry.name: entry for entry in FROM_FILE}
-    own = ", ".join(significant(value) for value in root_diagonal(before))
-    rows = []
-    for row, (covariance, conditions) in added.items():
-        correlations = axis_correlations(covariance, np.ones(3))
-        conditions += (
-            f", {significant(sensor.exposure_s)} s of exposure, beyond {own} arcsec of the "
+    own = root_diagonal(before)
+    rows: list[Contributor] = []
+    for row, covariance in added.items():
+        facts = {"of_rate": row == MOTION, "sensor": sensor, "own_arcsec": own}
+        rows += of_axes(
+            expected[row],
+            covariance,
+            conditions=clause(Remark.OF_SENSOR, n_frames=frames.n_frames, **facts),
+            provenance=f"sensor {name}".strip(),
+            source="file",
         )
-        conditions += f"sensor new and at rest; star geometry of {plural(frames.n_frames, 'frame')}"
-        for index, axis in enumerate(AXES):
-            rows.append(
-                replace(
-                    not_assessed(expected[row], axis),
-                    mean_arcsec=0.0,
-                    sigma_arcsec=float(np.sqrt(covariance[index, index])),
-                    axis_correlation=correlations[index],
-                    conditions=conditions,
-                    provenance=f"sensor {name}".strip(),
-                    source="file",
-                )
-            )
     return tuple(rows)
 
 

@@ -14,7 +14,6 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.status import Advice, Level, Note, Order
 from starcal_uq.core.types import AnyDict, Progress
 from starcal_uq.presentation.tables import TextTable
@@ -89,9 +88,7 @@ def talking(*, tables: bool, notes: bool, steps: bool) -> Iterator[None]:
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
     from starcal_uq.presentation.words.effects import effects_table
-    from starcal_uq.presentation.words.estimation import (
-        calibration_table,
-    )
+    from starcal_uq.presentation.words.estimation import calibration_table
     from starcal_uq.presentation.words.sentences import say as wording
     from starcal_uq.presentation.words.sentences import told
 
@@ -104,10 +101,8 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
     effects = None if calibration.effects is None else effects_table(calibration.effects)
     if effects is not None:
         print_table(effects)
-    for words in (told("fitted_noise", calibration) + "\n" + told("decided", calibration)).split(
-        "\n"
-    ):
-        if words:
+    for name in ("fitted_noise", "decided"):
+        for words in told(name, calibration).splitlines():
             say(words)
 
 
@@ -225,30 +220,10 @@ def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera)
     left out.
     """
     from starcal_uq.diagnostics.verdict.observed import aberration_size
-    from starcal_uq.presentation.words.sentences import say as wording
+    from starcal_uq.presentation.words.sentences import told
 
-    if not obs.directions_declared:
-        words = (
-            "warning: Neither time nor observer velocity was declared: annual aberration "
-            f"{wording('Part.aberration', **aberration_size(camera))}. "
-            "Declare --directions apparent, or --directions catalogue with a time_utc column."
-        )
+    for words in told("input_notes", obs, aberration=aberration_size(camera)).splitlines():
         tell(words)
-    origin = obs.origin
-    floor = origin.noise_floor_px
-    if floor:
-        words = (
-            f"note: even bright stars scatter by {significant(floor)} px; this was added to the "
-            "noise of every star."
-        )
-        tell(words)
-    if low := origin.low_stars:
-        words = f"note: {plural(low, 'star')} left out, because they stood lower than 10 degrees."
-        tell(words)
-    if origin.frame_names is not None:
-        tell(f"note: frames were numbered as they come: {origin.frame_names}.")
-    if ignored := origin.ignored_columns:
-        tell(f"note: columns not used: {', '.join(ignored)}")
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
-from starcal_uq.core.settings import Limit
+from starcal_uq.core.settings import KEYS, LIMITS, Limit
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.core.units import plain
 
@@ -139,7 +139,24 @@ class Key:
         return cls(kind, f"{words}, {range_}", required=required, ge=limit.low, le=limit.high)
 
 
-_TYPES = {kind.__name__: kind for kind in (float, int, str)}
+_TYPES: AnyDict = {kind.__name__: kind for kind in (bool, float, int, str)}
+_TYPES |= {"list[float]": list[float], "int | list[int]": int | list[int]}
+_TYPES |= {"dict[str, float]": dict[str, float]}
+
+
+def keys_of(table: Mapping[str, AnyDict]) -> dict[str, Key]:
+    """Keys as data state them: the words to choose from, or what to write, with a type and bounds
+    or the name of a limit.
+    """
+    return {name: _key(dict(stated)) for name, stated in table.items()}
+
+
+def _key(stated: AnyDict) -> Key:
+    if "words" in stated:
+        return Key.choice(**stated)
+    if limit := stated.pop("limit", ""):
+        return Key.number((LIMITS | KEYS)[limit], stated.pop("wanted"), **stated)
+    return Key(_TYPES[stated.pop("type")], **stated)
 
 
 @dataclass(frozen=True)
@@ -155,13 +172,7 @@ class Section:
     def of_data(cls, package: str | None, name: str, error: type[StarcalError]) -> Section:
         """The schema that a package holds as data, ``NAME.toml``: keys, and comments for a file."""
         content = tomllib.loads((files(package or "") / f"{name}.toml").read_text("utf-8"))
-        keys = {
-            key: Key.choice(**stated)
-            if "words" in stated
-            else Key(_TYPES[stated.pop("type")], **stated)
-            for key, stated in content["keys"].items()
-        }
-        return cls(keys, error, name, content["header"])
+        return cls(keys_of(content["keys"]), error, name, content["header"])
 
     @cached_property
     def _schema(self) -> type[BaseModel]:

@@ -5,6 +5,7 @@ counted.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -23,7 +24,7 @@ from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.records import hash_of
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
-from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
+from starcal_uq.core.toml import Key, Section, keys_of, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.inference.priors import PRIORS
 from starcal_uq.simulation.exclusion import Exclusion
@@ -51,36 +52,9 @@ VERSION = 1
 _SECTIONS = ("study", "camera", "sensor", "observation", "sweep", "priors")
 _SPACINGS = ("linear", "log")
 
-_STUDY = Section(
-    {
-        "name": Key(str, "a name in quotes"),
-        "question": Key(str, "the question that the study answers, in quotes"),
-        "mode": Key(str, f"one of {', '.join(MODES)}, in quotes"),
-        "seeds": Key(
-            int | list[int], "a number of repetitions of at least 1, or a list of whole numbers"
-        ),
-        "seed": Key.number(LIMITS["seed"], "the root of all that is random"),
-        "target_arcsec": Key.number(KEYS["target_arcsec"], "an error in arcsec"),
-        "target_sigma": Key(
-            dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"
-        ),
-        "camera": Key(str, "the path of a camera file in quotes"),
-        "sensor": Key(str, "the path of a sensor file in quotes"),
-        "time_utc": Key(str, "a UTC time in quotes, such as 2026-11-26T12:00:00"),
-        "position_km": Key(list[float], "x, y and z of the spacecraft in brackets, km"),
-        "epoch": Key.number(KEYS["epoch"], "a Julian year such as 2026.9"),
-        "geometries": Key.number(KEYS["geometries"], "a number of frames"),
-        "posterior": Key(str, f"one of {', '.join(POSTERIORS)}, in quotes"),
-        "draws": Key.number(KEYS["draws"], "a number of draws"),
-    },
-    StudyError,
-)
-_SPAN = {
-    "start": Key(float, "a number", required=True),
-    "stop": Key(float, "a number", required=True),
-    "n": Key.number(KEYS["values"], "a number of values", required=True),
-    "spacing": Key(str, "linear or log, in quotes"),
-}
+_DECLARED = tomllib.loads(Path(__file__).with_name("study.toml").read_text("utf-8"))
+_STUDY = Section(keys_of(_DECLARED["keys"]), StudyError)
+_SPAN = keys_of(_DECLARED["span"])
 _RANGE = {name: key for name, key in _SPAN.items() if name != "n"}
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from starcal_uq.core.remedy import Remedy
@@ -26,19 +24,13 @@ def image_calibration_text(images: ImageCalibration) -> str:
     )
 
 
-@dataclass(frozen=True)
-class Step:
-    """What to do next about a frame, in words, and the command that does it."""
-
-    words: str
-    remedy: Remedy
-
-
-def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
-    """What to do about a frame without a part in the calibration; None for others."""
+def next_step(frame: InspectedFrame, frames: Frames) -> tuple[str, Remedy] | None:
+    """What to do about a frame without a part in the calibration, in words, and the command that
+    does it; None for others.
+    """
     if frame.n(IDENTIFIED):
         return None
-    image = str(frame.path) if frame.path is not None else frame.row.image
+    image = frame.row.image if frame.path is None else str(frame.path)
     run, outcome = frames.run, frame.row.outcome
     # Much fainter ones are not detected, and take longer to be told apart.
     faintest = min(np.ceil(frames.searched_mag + 1.0), FAINTEST)
@@ -48,28 +40,17 @@ def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
     again = Remedy("identify", (f"{run}/centroids.parquet", *camera), found)
     lens = {"camera": camera[0]} if camera else {}
     centroid = Remedy("centroid", (image,), lens | {"out": "stars.csv"})
-    if other := next(
-        (other for other in frames.record.others if frame.row.frame in other.frames), None
-    ):
-        paths = [str(frames.paths[number]) for number in other.frames if number in frames.paths]
-        return Step(
-            "another camera took it: calibrate the frames of that camera by themselves.",
-            Remedy("run", tuple(paths), {"out": f"{run}-other"}),
-        )
-    if outcome == "identified":
-        images = tuple(str(source) for source in frames.images) or ("IMAGES",)
-        return Step(
-            "too few of its stars can be calibrated; search among fainter ones.",
-            Remedy("run", images + camera, {"out": f"{run}-deeper", **deeper}),
-        )
-    if outcome == "too few stars":
-        return Step("look for fainter stars, or expose longer.", centroid.having(threshold=3.5))
-    if outcome == "ambiguous":
-        return Step("identify it with what the other frames have told about the camera.", again)
-    if outcome in ("not identified", "not searched"):
-        words = (
-            "if it shows stars, and no clouds, trees or other field of view, search among "
-            "fainter ones."
-        )
-        return Step(words, again.having(**deeper))
-    return Step("hear the whole reason.", centroid)
+    images = tuple(map(str, frames.images)) or ("IMAGES",)
+    remedies = {
+        "identified": Remedy("run", images + camera, {"out": f"{run}-deeper", **deeper}),
+        "too few stars": centroid.having(threshold=3.5),
+        "ambiguous": again,
+        "not identified": again.having(**deeper),
+        "not searched": again.having(**deeper),
+    }
+    remedy = remedies.get(outcome, centroid)
+    others = (other.frames for other in frames.record.others if frame.row.frame in other.frames)
+    if other := next(others, None):
+        paths = tuple(str(frames.paths[number]) for number in other if number in frames.paths)
+        remedy = Remedy("run", paths, {"out": f"{run}-other"})
+    return told("next_step", frame, other=other), remedy

@@ -5,41 +5,33 @@ from __future__ import annotations
 import numpy as np
 
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import fixed
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.numbers import frames
-from starcal_uq.presentation.words.sentences import told
+from starcal_uq.presentation.words.sentences import table, told
 
 
 def check_text(check: ForecastCheck) -> str:
     """Whether forecast and simulation agree."""
-    table = check.to_dataframe()
-    worst = table.loc[(table["ratio"] - 1.0).abs().idxmax()]
+    rows = check.to_dataframe()
+    worst = rows.loc[(rows["ratio"] - 1.0).abs().idxmax()]
     outside = [int(n) for n in np.array(check.forecast.n_frames)[check.nees_rejected]]
     return told("forecast_check", check, worst=worst, outside=outside)
 
 
+# Heads of what only some cameras have.
+_GROWN = {
+    "x₀": "x0_px",
+    "f": "f_px",
+    "corner": "distortion_corner_px",
+    "common": "common_pitch_arcsec",
+}
+
+
 def costs_table(costs: EffectCosts) -> TextTable:
     """What effects cost: the growth of what is known of the camera, and attitude errors."""
-    import pandas as pd
-
-    grown = {
-        "x₀": ("x0_px", "y0_px"),
-        "f": ("f_px",),
-        "corner": ("distortion_corner_px",),
-        "common": ("common_pitch_arcsec", "common_yaw_arcsec"),
-    }
-    known = {head: names for head, names in grown.items() if set(names) <= set(costs.names)}
     rest = [costs.names.index(f"rest_{axis}_arcsec") for axis in AXES[:2]]
-    table = pd.DataFrame({"effects": costs.models})
-    table["scale [px]"] = table["effects"].map(costs.planned.scales)
-    for head, names in known.items():
-        table[head] = [costs.growth(model, *names) for model in costs.models]
-    table["rest [arcsec]"], table["camera alone aboard"] = (
-        np.sqrt(np.mean(sigma[:, rest] ** 2, axis=1)) for sigma in (costs.sigma, costs.camera_alone)
-    )
-    title = f"What effects cost after {frames(costs.n_frames)}: growth of sigmas, and the rest"
-    forms = dict.fromkeys(known, lambda factor: f"× {fixed(factor, 2)}")
-    return TextTable.of(table, title, formats=forms, missing="")
+    sigmas = {"known": costs.sigma, "alone": costs.camera_alone}
+    columns = {name: np.sqrt(np.mean(of[:, rest] ** 2, axis=1)) for name, of in sigmas.items()}
+    without = [head for head, name in _GROWN.items() if name not in costs.names]
+    return table("costs", {"costs": costs}, without, model=costs.models, **columns)
