@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from textwrap import wrap
 
 from starcal_uq.budgeting.rows import (
@@ -21,57 +22,18 @@ from starcal_uq.core.types import PathLike
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))
 
-_HEADER = f"""\
-# Error budget: what the calibration cannot know, and what is required.
-#
-# Remove the "# " in front of the lines of a contributor that you have assessed, and put your number in. What stays
-# commented out reads "not assessed" in the budget, never zero, and the totals read "at least".
-# What does not exist for your sensor: applies = false, with the reason as provenance.
-# A contributor of your own has a name that is not listed here, and states ecss_class, interpretation and
-# absorbed_by_alignment too. On an axis that it leaves out it is not assessed, unless applies = false is stated there.
-#
-# Keys of a contributor (values that are left out are those shown here for it):
-#   axis                   X (pitch), Y (yaw), Z (roll), cross-boresight (pitch and yaw, each), all
-#   sigma_arcsec           standard deviation; or half_width_arcsec for uniform (half its width) and arcsine (amplitude)
-#   mean_arcsec            known mean, with its sign; 0 if left out
-#   distribution           {", ".join(DISTRIBUTIONS)}
-#   ecss_class             {", ".join(ECSS_CLASSES[:5])},
-#                          {", ".join(ECSS_CLASSES[5:])}
-#   interpretation         what it is random over: {", ".join(INTERPRETATIONS)}
-#   absorbed_by_alignment  by an alignment calibration with the same camera parameters:
-#                          {", ".join(ABSORBED)} (exists only after it)
-#   correlation_group      rows with the same text here err together, on all axes: their sigmas add; "-text" errs
-#                          against those with "text"
-#   conditions             under what conditions the number holds
-#   provenance             where the number is from (a report, an analysis); it must be given
-
-[budget]
-title = "Star sensor: attitude error budget"
-confidence = 0.997
-
-# [document]                           # title block of the budget to sign: -o budget.pdf
-# project = "..."
-# number = "..."
-# issue = "1"
-# prepared = "..."                     # names, with room for signatures
-# checked = "..."
-# approved = "..."
-
-# [[requirement]]
-# name = "R-1 attitude knowledge across the boresight"
-# axis = "cross-boresight"             # X, Y, Z, or cross-boresight: the angle of both axes together
-# limit_arcsec = 10.0
-# confidence = 0.997
-# scope = "after alignment"            # or "before alignment"
-# interpretation = "mixed"             # or "ensemble" (a sensor at its worst moment), "temporal" (the worst sensor)
-# judged_by = "both"                   # the larger of "rule" and "sampling"
-# frame = "sensor"                     # or one with a table of its own:
-#
-# [frame.payload]
-# rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]   # v_payload = R v_sensor; or a quaternion (scalar
-#                                                                  # last)
-
-"""
+_HEADER = (
+    Path(__file__)
+    .with_name("starter.toml")
+    .read_text("utf-8")
+    .format(
+        distributions=", ".join(DISTRIBUTIONS),
+        first_classes=", ".join(ECSS_CLASSES[:5]),
+        other_classes=", ".join(ECSS_CLASSES[5:]),
+        interpretations=", ".join(INTERPRETATIONS),
+        absorbed=", ".join(ABSORBED),
+    )
+)
 
 
 def template_text(rows: Sequence[Contributor] = ()) -> str:

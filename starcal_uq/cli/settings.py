@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -73,10 +73,11 @@ class EstimationSettings:
                 "--relative-alignment-arcsec needs --relative-attitudes: give both, or leave it "
                 "out."
             )
-        own = {name: value for name, value in vars(self).items() if name not in _OF_CAMERA}
         # No workers (0) are a choice, and no absence of one.
         return {
-            name: value for name, value in own.items() if value is not None and value is not False
+            name: value
+            for name, value in vars(self).items()
+            if name not in _OF_CAMERA and value is not None and value is not False
         }
 
     def started(self, camera: Camera) -> Camera:
@@ -381,10 +382,7 @@ def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> N
         }
         kind = "tables of stars, not to images"
     else:
-        given = {
-            field.name: value
-            for field, value in zip(fields(of_images), astuple(of_images), strict=True)
-        }
+        given = vars(of_images)
         kind = "images, not to a table of stars"
     for name, value in given.items():
         if value not in (None, []):
@@ -427,12 +425,9 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
     from starcal_uq.core.manifest import identity
 
     paths = {key: value for key, value in settings.items() if isinstance(value, Path)}
-    plain, files = (
-        {**settings} | {key: str(path) for key, path in paths.items()},
-        {**files, **paths},
-    )
+    plain = {**settings, **{key: str(path) for key, path in paths.items()}}
     aligned = Path(str(plain.get("alignment")))
-    files = {**files, "alignment": aligned} if aligned.is_file() else files
+    files = {**files, **paths} | ({"alignment": aligned} if aligned.is_file() else {})
     return {"command": name, "settings": plain, "inputs": identity(files)}
 
 

@@ -4,6 +4,7 @@ everything on.
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import typer
@@ -12,6 +13,8 @@ import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import say
 from starcal_uq.core import runfile, settings
+
+_WORDS = tomllib.loads(Path(__file__).with_name("starters.toml").read_text("utf-8"))
 
 
 def new_command(
@@ -31,40 +34,25 @@ def new_command(
     path = Path("esa" if what == "example" else f"{what}.toml") if out is None else out
     if what == "example":
         sc.example_data("esa").save(path, force=force)
-        files = ", ".join(
-            str(path / name)
-            for name in ("stars.ecsv", "camera.toml", "site.toml", "NOTICE (whose data)")
-        )
-        following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN"
     elif what == "run":
         runfile.write_template(path, force)
-        following = f"put in your files and options, then starcal-uq run {path}"
     elif what == "camera":
         start = sc.paper.paper_start()
         # The centre of the detector, where the paper has a corner of its four middle pixels.
         x0, y0 = start.centre_px
         start.replace(name="my camera", x0_px=x0, y0_px=y0).save(path, force=force)
-        following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
     elif what == "sensor":
         sc.simulation.Sensor().save(path, force=force)
-        following = (
-            f"put in the numbers of your tracker, then starcal-uq plan CAMERA --sensor {path}"
-        )
     elif what == "site":
         example = sc.sky.Site(
             52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5
         )
         (example if near is None else sc.sky.Site(*near)).save(path, force=force)
-        following = (
-            f"put in where the camera stood, then starcal-uq run OBS CAMERA -o RUN --site {path}"
-        )
     elif what == "budget":
         sc.budgeting.write_budget_template(path, force=force)
-        following = (
-            f"take away the marks before what you know, then starcal-uq budget RUN --budget {path}"
-        )
     else:
         sc.studies.write_study_template(template or "fov-distortion", path, force)
-        following = f"change what is varied, then starcal-uq study {path} -o DIR"
-    say(f"{files if what == 'example' else path}: {following}")
+    following = _WORDS["following"][what].format(path=path)
+    files = _WORDS["files"].get(what, "{path}").format(path=path)
+    say(f"{files}: {following}")
     return Answer({"file": path, "text": following})

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import PlanningError, check_known
+from starcal_uq.core.settings import Scope
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
@@ -34,12 +35,7 @@ if TYPE_CHECKING:
     from starcal_uq.planning.information import FrameSet
 
 # Parts of the attitude error that a target can be set for: what is in the error of one attitude.
-SCOPES = {
-    "common": "the common rotation of the calibration",
-    "rest": "the rest of the calibration, after alignment",
-    "calibration": "the calibration, common rotation and rest together",
-    "total": "the calibration and the centroid noise of a frame together",
-}
+SCOPES = get_args(Scope)
 BAND = (0.05, 0.95)
 N_FRAMES = (10, 30, 100, 300, 1000, 3000)
 N_CAMPAIGNS = 200

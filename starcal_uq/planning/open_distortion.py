@@ -185,7 +185,7 @@ def distortion_range(
     """
     camera = base.camera
     percent = nodes(camera, bounds)
-    scopes = () if target_arcsec is None else tuple(SCOPES)
+    scopes = () if target_arcsec is None else SCOPES
     outlook = replace(outlook, n_campaigns=min(_CAMPAIGNS, outlook.n_campaigns))
     effects = None if base.seen is None else base.seen.planned
     frames, radius, sigmas = [], [], []

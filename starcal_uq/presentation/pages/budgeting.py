@@ -29,6 +29,7 @@ from starcal_uq.propagation.attitude_error import NOT_ASSESSED
 if TYPE_CHECKING:
     import pandas as pd
     from openpyxl import Workbook
+    from openpyxl.worksheet.worksheet import Worksheet
 
 # Heads of columns that have another name than their field.
 _HEADS = {
@@ -149,11 +150,11 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
     if budget.filter:
         states = budget.filter_dataframe()
         states["contributors"] = states["contributors"].map(join_words)
-        _sheet(book, "Filter", states, [""] * len(states))
+        _sheet(book, "Filter", states)
     created = budget.provenance.created_utc
     lines = [budget.title, created, told("budget", budget), *tables(budget)["explanations"]]
     notes = pd.DataFrame({"notes": [line for line in (*lines, *budget.notes) if line]})
-    _sheet(book, "Notes", notes, [""] * len(notes))
+    _sheet(book, "Notes", notes)
     with atomic_path(path) as temporary:
         book.save(temporary)
 
@@ -222,8 +223,7 @@ def _live_totals(book: Workbook, budget: Budget, columns: Sequence[str]) -> None
             )
         )
     heads = ("scope", "axis", "mean_arcsec", "sigma_arcsec", "factor", "rule_arcsec")
-    _sheet(book, "Live totals", pd.DataFrame(totals, columns=heads), [""] * len(totals))
-    sheet = book["Live totals"]
+    sheet = _sheet(book, "Live totals", pd.DataFrame(totals, columns=heads))
     for number, formulas in enumerate(totals, start=2):
         for cell, formula in zip(sheet[number], formulas, strict=True):
             cell.value, cell.number_format = formula, "0.0000"
@@ -240,7 +240,9 @@ def _head(name: str) -> str:
     return text[0].upper() + text[1:]
 
 
-def _sheet(book: Workbook, title: str, table: pd.DataFrame, colours: Sequence[str]) -> None:
+def _sheet(
+    book: Workbook, title: str, table: pd.DataFrame, colours: Sequence[str] = ()
+) -> Worksheet:
     """A sheet with a frozen header, a filter, widths, and coloured rows; NaN is an empty cell."""
     from openpyxl.styles import Alignment, Border, Font, PatternFill, Side
     from openpyxl.utils import get_column_letter
@@ -257,7 +259,7 @@ def _sheet(book: Workbook, title: str, table: pd.DataFrame, colours: Sequence[st
         head, *cells = sheet[letter]
         head.font, head.fill = Font(bold=True), PatternFill("solid", fgColor=_GROUND)
         head.alignment, head.border = Alignment(wrap_text=True), line
-        for cell, colour in zip(cells, colours, strict=True):
+        for cell, colour in zip(cells, colours or [""] * len(cells), strict=True):
             text = isinstance(cell.value, str)
             cell.alignment, cell.border = Alignment(wrap_text=text, vertical="top"), line
             if colour:
@@ -272,6 +274,7 @@ def _sheet(book: Workbook, title: str, table: pd.DataFrame, colours: Sequence[st
     sheet.page_setup.fitToHeight = 0
     sheet.sheet_properties.pageSetUpPr.fitToPage = True
     sheet.print_title_rows = "1:1"
+    return sheet
 
 
 def _cell(value: Any) -> Any:

@@ -28,7 +28,7 @@ from starcal_uq.maths.linear import root_diagonal
 from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.sentences import table
+from starcal_uq.presentation.words.sentences import table, told
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -184,25 +184,15 @@ def image_context(record: ImageRecord | None, cal: Calibration) -> AnyDict:
     """What the section shows; empty where the run did not start from images."""
     if record is None:
         return {"image_record": None}
-    rows = record.rows if len(record.rows) <= _LISTED else record.left_out[:_LISTED]
-    reasons = Counter(row.outcome for row in record.left_out)
+    left_out, few = record.left_out, len(record.rows) <= _LISTED
+    reasons = Counter(row.outcome for row in left_out).most_common()
     return {
         "image_record": record,
-        "image_rows": rows,
-        "image_reasons": [
-            f"{plural(number, 'image')}: {reason}" for reason, number in reasons.most_common()
-        ],
-        "image_listing": "Every image."
-        if len(record.rows) <= _LISTED
-        else _listing(len(record.left_out)),
+        "image_rows": record.rows if few else left_out[:_LISTED],
+        "image_reasons": [f"{plural(number, 'image')}: {reason}" for reason, number in reasons],
+        "image_listing": told("listing", record, few=few, most=_LISTED),
         "round_table": _round_table(record, cal),
     }
-
-
-def _listing(left_out: int) -> str:
-    if left_out > _LISTED:
-        return f"The first {_LISTED} of {count(left_out)} images that were left out."
-    return "The images that were left out."
 
 
 def _round_table(record: ImageRecord, cal: Calibration) -> TextTable | None:
