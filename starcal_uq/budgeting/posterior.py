@@ -179,10 +179,10 @@ def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
     """The rest of an effect, and what is in common; of frames by themselves nothing is."""
     expected = OF_EFFECTS[share.name]
     thermal = attitude.thermal if share.name == TEMPERATURE else None
-    told = clause(Remark.OF_EFFECT, attitude=attitude, thermal=thermal)
+    facts = {"attitude": attitude, "thermal": thermal}
     constant = share.rest_constant_arcsec**2 > 0.5 * np.diag(share.rest_covariance_arcsec2)
     entries = {
-        "conditions": told,
+        "conditions": clause(Remark.OF_EFFECT, **facts),
         "provenance": "effect of the calibration, propagated with the posterior",
         "source": "posterior",
     }
@@ -194,7 +194,7 @@ def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
             # A short peak of the temperature is beyond what the root mean square says.
             peak = float(thermal.peak_arcsec(attitude.onboard)[index])
             tail = (peak - abs(row.mean_arcsec)) / row.sigma_arcsec
-            words = clause(Remark.PEAK, told=told, peak_arcsec=peak)
+            words = clause(Remark.OF_EFFECT, **facts, peak_arcsec=peak)
             rest[index] = replace(row, conditions=words, tail_997=max(GAUSSIAN_997, tail))
     common = []
     if share.name != "frame" and share.common_arcsec.max() > _NOTHING_ARCSEC:
