@@ -13,7 +13,7 @@ from starcal_uq.core.formatting import pretty_unit
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.coupling import correlation_text, heat_map
+from starcal_uq.presentation.figures.coupling import heat_map
 from starcal_uq.presentation.figures.scales import symbol
 from starcal_uq.presentation.figures.sweeps import (
     held_title,
@@ -27,7 +27,7 @@ from starcal_uq.presentation.figures.sweeps import (
     two_axes,
 )
 from starcal_uq.presentation.words.axes import axis_label, value_words
-from starcal_uq.presentation.words.numbers import capital
+from starcal_uq.presentation.words.numbers import capital, correlation_text
 from starcal_uq.presentation.words.studies import best_axis, model_bias, simpler_models
 from starcal_uq.propagation.coupling import PART
 

@@ -63,12 +63,10 @@ def parameter_rows(results: Results) -> list[Row]:
     order, scale = np.arange(len(specs)), scales_of(specs)
     units = [spec.scaled_unit for spec in specs]
     if cal.camera.pixel_um is not None:
-        focal = cal.parameter_names.index("f")
-        order, scale = (
-            np.insert(of, focal + 1, value)
-            for of, value in ((order, focal), (scale, 1000.0 / cal.camera.pixel_um))
-        )
-        units.insert(focal + 1, "mm")
+        after = cal.parameter_names.index("f") + 1
+        order = np.insert(order, after, after - 1)
+        scale = np.insert(scale, after, 1000.0 / cal.camera.pixel_um)
+        units.insert(after, "mm")
     columns = {"mean": mean, "sd": sd, "low": low, "high": high, "start": start, "known": true}
     columns |= {"prior": prior, "prior_sd": prior_sd}
     scaled = {name: values[order] / scale for name, values in columns.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from starcal_uq.propagation.attitude_error import (
 )
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.field import FieldMap
-from starcal_uq.propagation.onboard_error import with_cross
+from starcal_uq.propagation.onboard_error import EffectError, with_cross
 from starcal_uq.propagation.spectrum import ErrorSpectrum
 from starcal_uq.propagation.thermal import ThermalError
 
@@ -110,7 +111,7 @@ def onboard_table(error: AttitudeError) -> TextTable:
 
 def thermal_table(error: ThermalError) -> TextTable:
     """Root mean square and peak over the profile by what the software aboard uses."""
-    kinds = {"model": error.model, "effects": error.effects}
+    kinds: dict[Any, EffectError] = {"model": error.model, "effects": error.effects}
     parts = {
         "common rotation": {kind: own.common_arcsec for kind, own in kinds.items()},
         "rest, rms over the profile": {kind: own.rest_arcsec for kind, own in kinds.items()},
@@ -120,7 +121,7 @@ def thermal_table(error: ThermalError) -> TextTable:
     return _aboard(parts, title)
 
 
-def _aboard(parts: Mapping[str, Mapping[str, FloatArray]], title: str) -> TextTable:
+def _aboard(parts: Mapping[str, Mapping[Any, FloatArray]], title: str) -> TextTable:
     """Sigmas (3,) of parts of an error, by what the software aboard uses."""
     rows = []
     for part, by in parts.items():

@@ -121,7 +121,7 @@ def _coverage(study: Study) -> list[tuple[str, AnyDict, float, bool]]:
     way to estimate, and whether chance explains it.
     """
     sweep = study.sweep
-    ways = [axis for axis in ("method", "likelihood", "prior") if axis in sweep.axes]
+    ways: list[str] = [axis for axis in ("method", "likelihood", "prior") if axis in sweep.axes]
     places: list[AnyDict] = [{}, *({axis: one} for axis in ways for one in sweep.values[axis])]
     found = []
     # One false alarm in a hundred studies, however many intervals are looked at.
