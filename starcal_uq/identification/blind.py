@@ -253,24 +253,17 @@ _made: dict[str, Level] = {}
 _VERSION = 1
 
 
-class Levels:
-    """The levels of a catalogue, made when they are first asked for, and kept in a `folder` where
-    there is one.
+def level_of(stars: StarCatalogue, n: int, folder: PathLike | None) -> Level:
+    """The level of the brightest n stars, made when it is first asked for, and kept in a `folder`
+    where there is one.
     """
+    bright = stars.brightest_first[1][:n]
 
-    def __init__(self, stars: StarCatalogue, folder: PathLike | None) -> None:
-        self._stars, self._folder = stars, folder
-
-    def __getitem__(self, n: int) -> Level:
-        return remembered(_made, _KEPT_LEVELS, self._stars.digest(n), partial(self._make, n))
-
-    def _make(self, n: int) -> Level:
-        bright = self._stars.brightest_first[1][:n]
-        make = partial(make_level, bright)
-        if self._folder is None:
-            return make()
+    def make() -> Level:
         key = digest_of((bright,), _VERSION, _CELL, _nearest(len(bright)))
-        return cached(Level, f"star-patterns-{key}", make, self._folder)
+        return cached(Level, f"star-patterns-{key}", partial(make_level, bright), folder)
+
+    return remembered(_made, _KEPT_LEVELS, stars.digest(n), make)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,8 +301,7 @@ class BlindSearch:
     def __init__(
         self, stars: StarCatalogue, width_px: int, height_px: int, folder: PathLike | None = None
     ) -> None:
-        self.stars = stars
-        self.levels = Levels(stars, folder)
+        self.stars, self.folder = stars, folder
         self.width, self.height = float(width_px), float(height_px)
         corner = 0.5 * float(np.hypot(width_px, height_px))
         self.geometry = FieldGeometry(self.width, self.width, self.height, corner)
@@ -378,7 +370,7 @@ class BlindSearch:
             use = (most > stars / high**2) & (least < stars / low**2)
             if not use.any():
                 continue
-            level, used = self.levels[n], use[row]
+            level, used = level_of(self.stars, n, self.folder), use[row]
             mine, theirs = level.alike(codes, row[used], cell[used])
             f = focal * size[mine] / level.size_rad[theirs]
             expected = stars / f**2

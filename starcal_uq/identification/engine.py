@@ -193,8 +193,8 @@ def identify(
     if calibration is not None:
         sheet, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
     offered_engine(engine)
-    prepare = partial(prepare_engine, engine, cache=cache, cache_dir=cache_dir)
     folder = (cache_dir or default_cache_dir()) if cache else None
+    prepare = partial(prepare_engine, engine, folder=folder)
     attempt = _Attempt(centroids, catalogue, sheet, tolerance, prepare, share_camera)
     _check(centroids, sheet, attempt.stars)
     searching = search_focal and calibration is None

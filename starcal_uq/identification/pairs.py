@@ -30,8 +30,6 @@ from starcal_uq.core.types import FloatArray, IntArray, PathLike
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from starcal_uq.sky.catalogue import StarCatalogue
-
 K = TypeVar("K")
 V = TypeVar("V")
 # Stars a field should hold; a star with this many brighter ones within a field's area around it is
@@ -206,27 +204,6 @@ def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
     return angle
 
 
-# What was prepared last, for cameras that are used in turns; the key says for what.
-_RECENT = 4
-_recent: dict[tuple[str, float, float], StarPairs] = {}
-
-
-def prepared_star_pairs(
-    stars: StarCatalogue,
-    field_sr: float,
-    max_angle_rad: float,
-    cache: bool,
-    cache_dir: PathLike | None = None,
-) -> StarPairs:
-    """The pairs that this process has used before, or else those of the file where `cache` is on,
-    or new ones.
-    """
-    given = stars.directions_icrs, stars.mag, field_sr, max_angle_rad
-    make = partial(cached_star_pairs, cache_dir=cache_dir) if cache else find_star_pairs
-    key = stars.digest(len(stars)), field_sr, max_angle_rad
-    return remembered(_recent, _RECENT, key, partial(make, *given))
-
-
 def remembered(kept: dict[K, V], most: int, key: K, make: Callable[[], V]) -> V:
     """What was made for a key, of which the last ones are kept."""
     found = kept.pop(key, None)
@@ -251,12 +228,12 @@ def cached_star_pairs(
     mag: FloatArray,
     field_sr: float,
     max_angle_rad: float,
-    cache_dir: PathLike | None = None,
+    folder: PathLike | None,
 ) -> StarPairs:
     """`find_star_pairs`, `cached` in the folder."""
     given = directions, mag, field_sr, max_angle_rad
     key = digest_of((directions, mag), _VERSION, field_sr, max_angle_rad, PATTERN_STARS)
-    return cached(StarPairs, f"star-pairs-{key}", partial(find_star_pairs, *given), cache_dir)
+    return cached(StarPairs, f"star-pairs-{key}", partial(find_star_pairs, *given), folder)
 
 
 class Fitting(Protocol):
@@ -270,22 +247,23 @@ class Fitting(Protocol):
 F = TypeVar("F", bound=Fitting)
 
 
-def cached(kind: type[F], name: str, make: Callable[[], F], cache_dir: PathLike | None) -> F:
-    """A dataclass of arrays from a file of the cache folder where there is one, leaving one there
-    where there is none.
+def cached(kind: type[F], name: str, make: Callable[[], F], folder: PathLike | None) -> F:
+    """A dataclass of arrays from a file of the `folder` where there is one, leaving one there where
+    there is none; without a folder, one that is made.
 
     The `name` holds a hash of all that it is made of. A damaged file is replaced; a folder that
     cannot be written to does no harm.
     """
-    folder = default_cache_dir() if cache_dir is None else Path(cache_dir)
-    path = folder / f"{name}.npz"
+    if folder is None:
+        return make()
+    path = Path(folder) / f"{name}.npz"
     stored = _read(path, kind)
     if stored is not None:
         return stored
     made = make()
     # The cache only saves time: without it everything works.
     with suppress(OSError, RunFolderError):
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             np.savez(temporary, **{name: getattr(made, name) for name in _names(kind)})
     return made

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from os import PathLike
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -14,8 +13,8 @@ import numpy as np
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.extras import entry_point
 from starcal_uq.core.files import shown
-from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
+from starcal_uq.core.types import FloatArray, PathLike
+from starcal_uq.identification.pairs import StarPairs, cached_star_pairs, remembered
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -23,6 +22,9 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP = "starcal_uq.engines"
+# The pairs that were prepared last, for cameras that are used in turns.
+_RECENT = 4
+_recent: dict[tuple[str, float, float], StarPairs] = {}
 
 # Batches of hypotheses from points, their noise, the camera, its tolerances, the number of
 # centroids to look at, and the number of those that were searched before: `pyramid.hypotheses` with
@@ -37,8 +39,7 @@ def prepare_engine(
     stars: StarCatalogue,
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
-    cache: bool,
-    cache_dir: str | PathLike[str] | None,
+    folder: PathLike | None,
 ) -> Proposer:
     """The catalogue prepared for "pyramid", or for the engine that a package offers under this name:
     a function of stars, geometry and tolerance that gives a `Proposer`.
@@ -47,7 +48,7 @@ def prepare_engine(
     """
     found = offered_engine(engine)
     if found is None:
-        pairs = prepare_pairs(stars, geometry, tolerance, cache, cache_dir)
+        pairs = prepare_pairs(stars, geometry, tolerance, folder)
         return partial(hypotheses, pairs.ready())
     proposer: Proposer = found.load()(stars, geometry, tolerance)
     return proposer
@@ -72,13 +73,16 @@ def prepare_pairs(
     stars: StarCatalogue,
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
-    cache: bool,
-    cache_dir: str | PathLike[str] | None,
+    folder: PathLike | None,
 ) -> StarPairs:
-    """Pattern stars and their pairs for a field of view."""
+    """Pattern stars and their pairs for a field of view: those that this process has used before, or
+    else those of a file in the `folder` where there is one, or new ones.
+    """
     f, w, h = geometry.focal_px, geometry.width_px, geometry.height_px
     largest = 2.0 * float(np.arctan(0.5 * np.hypot(w, h) / f)) * (1.0 + tolerance.focal) + 0.002
     # Rounded, so that cameras of nearly the same field share a file.
     largest = float(np.ceil(largest * 200.0) / 200.0)
     field_sr = float(f"{w * h / f**2:.2g}")
-    return prepared_star_pairs(stars, field_sr, largest, cache, cache_dir)
+    given = stars.directions_icrs, stars.mag, field_sr, largest
+    key = stars.digest(len(stars)), field_sr, largest
+    return remembered(_recent, _RECENT, key, partial(cached_star_pairs, *given, folder))

@@ -39,15 +39,14 @@ def phase_error(along_px: FloatArray, across_px: FloatArray) -> PhaseError:
 
     Stars that come back to the same place, as in a camera that stares, count as one.
     """
-    if len(along_px) < _FEWEST_PLACES:
-        return PhaseError(0.0, np.inf)
-    places = np.floor(np.column_stack([along_px, across_px]) / _PLACE_PX).astype(np.int64)
-    unique, index = np.unique(places, axis=0, return_inverse=True)
+    # Complex numbers are sorted several times faster than rows.
+    places = np.floor(along_px / _PLACE_PX) + 1j * np.floor(across_px / _PLACE_PX)
+    unique, index = np.unique(places, return_inverse=True)
     if len(unique) < _FEWEST_PLACES:
         return PhaseError(0.0, np.inf)
     cosine = np.cos(2.0 * np.pi * along_px)
     mean = float(cosine.mean())
-    sums = np.bincount(index.reshape(-1), cosine - mean)
+    sums = np.bincount(index, cosine - mean)
     amplitude, error = mean / np.pi, float(np.sqrt(np.sum(sums**2))) / len(along_px) / np.pi
     # Crowding away from the centres has other causes, such as sharp stars taken for hot pixels.
     return PhaseError(

@@ -88,11 +88,8 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     most = _PSF_STARS if clear else 5 * _PSF_STARS
     # Moments are of the filtered image, in which stars are wider.
     first = max(float(np.sqrt(max(sigma**2 - FIRST_SIGMA_PX**2, 0.0))), 0.6 * sigma)
-    x, y, widths = (
-        chosen["x"].astype(np.float64),
-        chosen["y"].astype(np.float64),
-        np.full(len(chosen), first),
-    )
+    x, y = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64)
+    widths = np.full(len(chosen), first)
     for left_moving in _LEFT_MOVING:
         clean, stamps = _clean_stamps(frame, chosen, sigma, most)
         if not len(clean):
@@ -139,12 +136,8 @@ def _elongation(stamps: Stamps, fit: StarFit, good: BoolArray) -> float:
     window = max(_MOMENT_WINDOW_PX, 1.2 * float(median_of(fit.sigma_px)))
     sums = window_moments(stamps, stamps.counts, fit.x_px, fit.y_px, window)[..., good]
     xx, yy, xy = sums[[0, 2, 1], [2, 0, 1]] / sums[0, 0]
-    mean, half, cross = (
-        0.5 * float(median_of(xx + yy)),
-        _significant(0.5 * (xx - yy)),
-        _significant(xy),
-    )
-    apart = float(np.hypot(half, cross))
+    mean = 0.5 * float(median_of(xx + yy))
+    apart = float(np.hypot(_significant(0.5 * (xx - yy)), _significant(xy)))
     if not apart < mean < window**2 - apart:
         return 1.0
     long, wide = (1.0 / (1.0 / (mean + sign * apart) - window**-2) for sign in (1.0, -1.0))

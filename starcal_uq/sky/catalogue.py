@@ -112,12 +112,10 @@ class StarCatalogue(Shown):
         return rows, self.directions_icrs[rows], self.mag[rows]
 
     def digest(self, n: int) -> str:
-        """Hash of the directions and magnitudes of the brightest n stars."""
+        """Hash of the brightest n stars: their rows, directions and magnitudes."""
         if n not in self._digests:
-            found = hashlib.sha256()
-            for values in self.brightest_first[1:]:
-                found.update(values[:n].tobytes())
-            self._digests[n] = found.hexdigest()
+            content = np.column_stack([part[:n] for part in self.brightest_first])
+            self._digests[n] = hashlib.sha256(content.tobytes()).hexdigest()
         return self._digests[n]
 
     @cached_property

@@ -16,7 +16,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.identification import blind
-from starcal_uq.identification.blind import Levels, codes_of, make_level, quads_of
+from starcal_uq.identification.blind import codes_of, level_of, make_level, quads_of
 from starcal_uq.identification.engine import _Attempt, identify
 from starcal_uq.identification.match import Match
 from starcal_uq.identification.pairs import angle_between, cached
@@ -420,7 +420,7 @@ def test_patterns_are_kept_on_disk_and_damaged_files_made_again(
 
     def level(stars: sc.StarCatalogue, folder: Path | None) -> blind.Level:
         blind._made.clear()
-        return Levels(stars, folder)[256]
+        return level_of(stars, 256, folder)
 
     first = level(stars, folder)
     (path,) = folder.iterdir()

@@ -269,7 +269,7 @@ def identify_all(
     """Identify the frames once for each job (camera, tolerance in px)."""
     # One set of pairs serves all cameras, whose fields differ little.
     wide = CameraTolerance(0.03, 0.0, 0.0)
-    proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, False, None)
+    proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, None)
     task = _IdentifyTask(frames, truth, stars, jobs, proposer)
     found, _ = run_tasks(
         task,
