@@ -43,7 +43,7 @@ def any_sensor(seed: int) -> tuple:
     return field, size, 5.0 * 2000.0 ** u[7], stars, frames, noise, 0.08 * (u[5] - 0.5), tuple(bend)
 
 
-SENSORS |= {f"sensor {seed}": any_sensor(seed) for seed in range(100)}
+SENSORS |= {f"sensor {seed}": any_sensor(seed) for seed in range(60)}
 
 
 def observed(name: str, seed: int, **options) -> Campaign:
@@ -305,7 +305,7 @@ def test_stars_in_odd_places_that_determine_everything(place, effects):
 
 
 @pytest.mark.slow
-def test_a_hundred_random_sensors_are_calibrated_or_told_what_is_missing():
+def test_sixty_random_sensors_are_calibrated_or_told_what_is_missing():
     squares, left_open = [], []
     for name in (name for name in SENSORS if name.startswith("sensor")):
         c = observed(name, 0)
@@ -318,4 +318,4 @@ def test_a_hundred_random_sensors_are_calibrated_or_told_what_is_missing():
     assert max(squares) < UNLIKELY
     # Chi-square with five degrees of freedom, a little wider where few stars tell the noise.
     assert stats.kstest(squares, stats.chi2(5).cdf).pvalue > 1e-3
-    assert len(left_open) < 12
+    assert len(left_open) < 8

@@ -83,6 +83,7 @@ def test_even_noise_is_left_as_it_is():
         common.covariance, fitted.covariance
     )
     assert weighed(obs, fitted) is obs and fitted.sigma_name == "sigma"
+    assert fitted.noise_model.axes is None
 
 
 def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they_are(tmp_path):
@@ -125,15 +126,8 @@ def test_screening_measures_stars_by_the_noise_where_they_are():
     assert fitted.observations.sigma_px is None and fitted.calibration.noise_model.varies
 
 
-def test_settings_that_do_not_go_together_are_refused_in_a_sentence():
+def test_keywords_of_earlier_versions_name_the_effect_in_their_place():
     _, obs, camera = scene(even, n_frames=6)
-    for options, words in (
-        ({"effects": "uneven"}, "effect 'uneven' is unknown"),
-        ({"effects": "noise", "method": "three_stage"}, "method='efficient'"),
-    ):
-        with pytest.raises(sc.errors.CalibrationError, match=words):
-            sc.calibrate(obs, camera, **options)
-    # Keywords of earlier versions name the effect in their place.
     earlier = {"noise": "model", "likelihood": "student_t", "star_errors": True}
     for (name, value), effect in zip(earlier.items(), ("noise", "tails", "star"), strict=True):
         with pytest.raises(TypeError, match=f"use effects='{effect}'"):
@@ -195,10 +189,10 @@ def quick(sigma, seed):
 @pytest.mark.slow
 def test_intervals_hold_the_truth_with_the_model_and_not_without():
     bound = stats.t.ppf(0.975, 2 * 24 * 12 - 3 * 24 - 5) ** 2
-    squares = [quick(worse_outside_and_for_faint, seed) for seed in range(200)]
+    squares = [quick(worse_outside_and_for_faint, seed) for seed in range(120)]
     inside = np.mean(np.array(squares) < bound, axis=0)
     print("coverage with one noise", inside[0], "with the model", inside[1])
     k2 = 4
     assert inside[0, k2] < 0.80
-    # One parameter's share of 200 has a standard error of 1.5 %.
-    assert 0.93 < np.mean(inside[1]) < 0.97 and np.all(inside[1] > 0.90)
+    # One parameter's share of 120 has a standard error of 2 %.
+    assert 0.925 < np.mean(inside[1]) < 0.975 and np.all(inside[1] > 0.89)

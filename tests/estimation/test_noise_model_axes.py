@@ -95,12 +95,6 @@ def test_attitude_noise_is_that_of_the_axes():
     assert np.all(cal.sigmas < 0.9 * common.sigmas)
 
 
-def test_even_noise_has_no_axes():
-    obs, camera = given(observed(EVEN, 1))
-    cal, common = (sc.calibrate(obs, camera, effects=effects) for effects in ("noise", "none"))
-    assert cal.noise_model.axes is None and np.array_equal(cal.theta, common.theta)
-
-
 def test_axes_go_with_compressed_likelihoods_and_plans():
     c = observed(SMEARED, 2, n_frames=40)
     obs, camera = given(c)
@@ -164,7 +158,7 @@ def test_misfit_tests_keep_their_size_with_fitted_axes():
 @pytest.mark.slow
 def test_intervals_with_fitted_axes_hold():
     inside, wrong = [], []
-    for seed in range(60):
+    for seed in range(40):
         c = observed(TURNED, seed)
         obs, camera = given(c)
         cal = sc.calibrate(obs, camera, effects="noise")
@@ -173,5 +167,5 @@ def test_intervals_with_fitted_axes_hold():
         # The control: intervals as narrow for the estimate that weighs both axes alike.
         error = np.abs(sc.calibrate(obs, camera).theta - c.theta)
         wrong.append(error < 0.5 * (high - low))
-    assert 0.92 < np.mean(inside) < 0.98
+    assert 0.91 < np.mean(inside) < 0.985
     assert np.mean(wrong) < 0.9

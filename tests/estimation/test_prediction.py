@@ -59,7 +59,7 @@ def test_what_no_effect_moves_is_refused() -> None:
 @pytest.mark.slow
 def test_predictions_cover() -> None:
     z = []
-    for seed in range(60):
+    for seed in range(40):
         c, obs, focal_px = warmed(seed, slope_px=0.2, n_frames=20)
         cal = sc.calibrate(obs, sheet(c), effects="temperature")
         z.append(
@@ -71,7 +71,8 @@ def test_predictions_cover() -> None:
         )
     covered = np.mean(np.abs(z) < 1.96, axis=0)
     print("covered", covered)
-    assert np.all(covered > 0.86)
+    # A share of 40 has a standard error of 3.4 %.
+    assert np.all(covered > 0.85)
     assert np.sqrt(np.mean(np.square(z))) > 0.75
 
 

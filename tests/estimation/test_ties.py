@@ -33,7 +33,6 @@ def test_a_gyro_tells_the_principal_point_from_the_boresight() -> None:
     c, columns = observed(1)
     plain = sc.calibrate(table(c), sheet(c))
     cal = sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns))
-    assert cal.ties is not None
     np.testing.assert_array_equal(cal.ties.sigmas_without, plain.sigmas)
     assert np.all(cal.sigmas[:2] < 0.03 * plain.sigmas[:2])
     assert np.all(np.abs(cal.theta - c.theta) < 4.0 * cal.sigmas)
@@ -46,13 +45,11 @@ def test_a_gyro_tells_the_principal_point_from_the_boresight() -> None:
 def test_rotations_that_contradict_the_stars_are_found() -> None:
     c, columns = observed(2, 5.0)
     cal = sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns, 0.2))
-    assert cal.ties is not None
     assert cal.ties.p_value < 1e-6
     assert cal.ties.error_factor == pytest.approx(5.0, rel=0.25)
     again = sc.calibrate(
         table(c), sheet(c), relative_attitudes=cal.ties.known.scaled(cal.ties.error_factor)
     )
-    assert again.ties is not None
     assert again.ties.p_value > 0.1
 
 
@@ -68,7 +65,6 @@ def test_a_fixed_mount_leaves_the_common_rotation_free() -> None:
     c, obs = on_a_mount(4)
     plain = sc.calibrate(obs, sheet(c))
     cal = sc.calibrate(obs, sheet(c), mount="fixed", mount_sigma_arcsec=1.0)
-    assert cal.ties is not None
     assert cal.dof == plain.dof + 3 * (N - 1)
     assert cal.ties.p_value > 0.001
     assert np.all(cal.sigmas[:3] < plain.sigmas[:3])
@@ -90,67 +86,31 @@ def test_a_narrow_field_whose_point_the_stars_leave_open_is_determined() -> None
     assert np.all(np.abs(cal.theta - c.theta[:3]) < 4.0 * cal.sigmas)
     assert np.all(cal.sigmas[:2] < 1.0)
     # Around the point that the stars alone give, hundreds of pixels away, nothing is linear.
-    assert cal.ties is not None
     assert cal.ties.p_value > 0.001
     assert sc.diagnose(table(c), cal, models=(), n_starts=2).starts is None
 
 
-def test_a_calibration_with_ties_survives_its_file_and_is_sampled(tmp_path) -> None:
+def test_a_calibration_with_ties_is_sampled() -> None:
     c, columns = observed(6, 10.0)
     cal = sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns))
-    cal.save(tmp_path / "c.json")
-    again = sc.Calibration.load(tmp_path / "c.json")
-    assert again.ties is not None
-    assert cal.ties is not None
-    for name in ("frame_a", "frame_b", "quaternions", "sigma_arcsec"):
-        np.testing.assert_array_equal(
-            getattr(again.ties.known, name), getattr(cal.ties.known, name)
-        )
-    post = sc.sample(table(c), again, seed=1)
+    post = sc.sample(table(c), cal, seed=1)
     assert post.diagnostics.likelihood_used == "compressed"
     assert post.diagnostics.compressed_max_difference < 0.01
     np.testing.assert_allclose(post.theta_draws.std(axis=0), cal.sigmas, rtol=0.06)
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"mount": "fixed"}, "mount_sigma_arcsec is"),
-        ({"mount": "fixed", "mount_sigma_arcsec": 1.0}, "no time_utc"),
-        ({"mount_sigma_arcsec": 1.0}, "mount_sigma_arcsec=1.0 needs mount='fixed'"),
-        ({"mount": "steady"}, "mount 'steady' is unknown"),
-        ({"relative_attitudes": True, "effects": "frame"}, "effects"),
-        ({"relative_attitudes": True, "method": "three_stage"}, "needs method='efficient'"),
-    ],
-)
-def test_what_cannot_be_is_refused(options: dict[str, object], match: str) -> None:
-    c, columns = observed(7)
-    if "relative_attitudes" in options:
-        options = options | {"relative_attitudes": known_of(columns)}
-    with pytest.raises(CalibrationError, match=match):
-        sc.calibrate(table(c), sheet(c), **options)
-
-
-def test_a_frame_that_the_table_does_not_hold_is_refused() -> None:
-    c, columns = observed(8)
-    columns = columns | {"frame_b": columns["frame_b"] + 1}
-    with pytest.raises(CalibrationError, match="name frame 30, which the table does not hold"):
-        sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("arcsec", "first"), [(1.0, 1000), (10.0, 2000)])
 def test_intervals_of_a_chain_cover(arcsec: float, first: int) -> None:
     z, chi2 = [], []
-    for seed in range(40):
+    for seed in range(30):
         c, columns = observed(first + seed, arcsec)
         cal = sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns))
-        assert cal.ties is not None
         z.append((cal.theta - c.theta) / cal.sigmas)
         chi2.append(cal.ties.chi2 / cal.ties.dof)
     covered = np.mean(np.abs(z) < 1.96, axis=0)
     print("covered", covered, "rms", np.sqrt(np.mean(np.square(z), axis=0)), np.mean(chi2))
-    # 80 intervals of x0 and y0: 0.95 with a standard deviation of 0.024; the others go together.
+    # 60 intervals of x0 and y0: 0.95 with a standard deviation of 0.028; the others go together.
     assert 0.88 <= covered[:2].mean() <= 0.99
     assert 0.85 <= covered[2:].mean() <= 1.0
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.1)
@@ -162,7 +122,6 @@ def test_intervals_of_a_chain_with_errors_five_times_the_stated_do_not_cover() -
     for seed in range(12):
         c, columns = observed(300 + seed, 5.0)
         cal = sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns, 0.2))
-        assert cal.ties is not None
         z.append((cal.theta - c.theta)[:2] / cal.sigmas[:2])
         found.append(cal.ties.p_value < 0.001)
     assert np.all(found)

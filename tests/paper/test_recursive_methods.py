@@ -17,7 +17,6 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.recursive.stream import RecursiveCalibration
-from tests.helpers.same import assert_same
 from tests.helpers.scenes import USUAL, camera, nominal, observations, with_sigmas
 
 ALL = RecursionOptions(parameters="all")
@@ -137,6 +136,8 @@ def test_a_stream_gives_what_the_table_gives(method, options, stated):
             np.abs(turned)
         )
         assert np.allclose(np.diag(cal.attitude_noise), np.diag(table.attitude_noise), rtol=5e-3)
+    with pytest.raises(CalibrationError, match="kept no residuals"):
+        cal.plot.residuals(obs)
 
 
 def test_the_likelihood_of_a_stream_is_that_of_the_table():
@@ -156,17 +157,6 @@ def test_the_likelihood_of_a_stream_is_that_of_the_table():
     reference = sc.sample(obs, table, seed=1, n_steps=100)
     sigmas = np.sqrt(np.diag(reference.covariance))
     assert np.max(np.abs(post.mean[:5] - reference.mean[:5]) / sigmas[:5]) < 0.15
-
-
-def test_a_stream_calibration_saves_itself(tmp_path):
-    cal = run(iter(one_by_one(observations())), sc.paper.paper_start(), "samaan")
-    cal.save(tmp_path / "calibration.json")
-    again = sc.Calibration.load(tmp_path / "calibration.json")
-    assert_same(cal, again)
-    assert (again.n_stars, again.n_frames) == (cal.n_stars, 60)
-    assert "focal length" in again._repr_html_()
-    with pytest.raises(CalibrationError, match="kept no residuals"):
-        again.plot.residuals(observations())
 
 
 @pytest.mark.parametrize("method", ["samaan", "griffith"])
@@ -192,22 +182,15 @@ def test_a_mirror_is_seen(method):
 
 def test_what_is_refused():
     obs = observations()
-    with pytest.raises(CalibrationError, match="least_squares, samaan, griffith"):
-        sc.calibrate(obs, sc.paper.paper_start(), method="magic")
-    with pytest.raises(CalibrationError, match="needs all frames at once"):
-        sc.calibrate(one_by_one(obs), sc.paper.paper_start())
-    with pytest.raises(CalibrationError, match="recursion needs method='samaan' or method="):
-        sc.calibrate(obs, sc.paper.paper_start(), recursion=RecursionOptions())
-    with pytest.raises(CalibrationError, match="holds a str"):
-        sc.calibrate(["frames.parquet"], sc.paper.paper_start(), method="griffith")
-    with pytest.raises(CalibrationError, match="no frame yet"):
-        sc.calibrate([], sc.paper.paper_start(), method="griffith")
-    for method in ("least_squares", "samaan", "griffith"):
-        with pytest.raises(CalibrationError, match="effects='tails' needs method='efficient'"):
-            sc.calibrate(obs, sc.paper.paper_start(), method=method, effects="tails")
-        three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
-        with pytest.raises(CalibrationError, match="3 stars in 1 frames"):
-            sc.calibrate(three, sc.paper.paper_start(), method=method)
+    three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
+    for source, options, words in (
+        (one_by_one(obs), {}, "needs all frames at once"),
+        (["frames.parquet"], {"method": "griffith"}, "holds a str"),
+        ([], {"method": "griffith"}, "no frame yet"),
+        *((three, {"method": name}, "3 stars in 1 frames") for name in ("least_squares", "samaan")),
+    ):
+        with pytest.raises(CalibrationError, match=words):
+            sc.calibrate(source, sc.paper.paper_start(), **options)
 
 
 def test_a_source_that_changes_is_found_out():
@@ -227,7 +210,7 @@ def test_a_source_that_changes_is_found_out():
 
 
 @lru_cache(maxsize=1)
-def drifting(px_per_frame, n_frames=200, seed=5):
+def drifting(px_per_frame, n_frames=120, seed=5):
     """Frames of a camera whose focal length grows."""
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     truth = camera("none")
@@ -247,40 +230,18 @@ def drifting(px_per_frame, n_frames=200, seed=5):
     ],
 )
 def test_a_drifting_focal_length_is_followed(method, options):
-    final = camera("none").theta[2] + 0.05 * 199
+    final = camera("none").theta[2] + 0.08 * 119
     steps = RecursiveCalibration(nominal(camera("none")), method, options)
-    for frame in drifting(0.05):
+    for frame in drifting(0.08):
         step = steps.update(frame)
     assert abs(step.theta[2] - final) < 4.0 * step.sigmas[2] + 0.5
     # Control: a filter that takes the camera as constant stays behind by half of the drift, and
     # does not know it.
     still = RecursiveCalibration(nominal(camera("none")), method)
-    for frame in drifting(0.05):
+    for frame in drifting(0.08):
         stays = still.update(frame)
     assert final - stays.theta[2] > 3.0
     assert (final - stays.theta[2]) / stays.sigmas[2] > 10.0
-
-
-def replicates(truth, start, method, options, n, n_frames=200):
-    """Estimates, their sigmas, and those that the filter itself claims."""
-    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    found, sigmas, claimed = [], [], []
-    for seed in range(n):
-        obs = sc.simulate(stars, truth, n_frames=n_frames, min_stars=10, sigma_px=0.05, seed=seed)
-        cal = run(obs, start, method, options)
-        found.append(cal.theta)
-        sigmas.append(cal.sigmas)
-        claimed.extend(stage.sigmas[-1] for stage in cal.stages if stage.name == "filter")
-    return np.array(found), np.array(sigmas), np.array(claimed)
-
-
-def variance_ratio(errors, sigmas):
-    return np.mean(errors**2, axis=0) / np.mean(sigmas**2, axis=0)
-
-
-# 100 replicates: a right variance ratio strays by 0.14, a right coverage by 2.2 %;
-# bounds are four times that.
-N_REPLICATES = 100
 
 
 @pytest.mark.slow
@@ -289,16 +250,21 @@ def test_the_filter_is_right_where_its_model_is():
     agree with the spread. Of the others `test_replicates` says so, and of the diagonal covariance
     that it claims too little.
     """
-    truth = camera("none")
-    found, sigmas, claimed = replicates(truth, nominal(truth), "samaan", None, N_REPLICATES)
-    errors = found - truth.theta
-    for widths in (sigmas, claimed):
-        assert np.all(np.abs(variance_ratio(errors, widths) - 1.0) < 0.55), variance_ratio(
-            errors, widths
-        )
+    truth, stars = camera("none"), sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    found = []
+    for seed in range(100):
+        obs = sc.simulate(stars, truth, n_frames=100, min_stars=10, sigma_px=0.05, seed=seed)
+        cal = run(obs, nominal(truth), "samaan")
+        claimed = next(stage.sigmas[-1] for stage in cal.stages if stage.name == "filter")
+        found.append((cal.theta - truth.theta, cal.sigmas, claimed))
+    errors, *both = np.array(found).transpose(1, 0, 2)
+    # A right variance ratio strays by 0.14, a right coverage by 2.2 %; bounds are four times that.
+    for widths in both:
+        ratio = np.mean(errors**2, axis=0) / np.mean(widths**2, axis=0)
+        assert np.all(np.abs(ratio - 1.0) < 0.55), ratio
         coverage = np.mean(np.abs(errors / widths) < 1.96, axis=0)
         assert (coverage > 0.85).all(), coverage
-    assert (np.abs(np.mean(errors / sigmas, axis=0)) < 4.0 / np.sqrt(N_REPLICATES)).all()
+    assert (np.abs(np.mean(errors / both[0], axis=0)) < 4.0 / np.sqrt(len(errors))).all()
 
 
 def test_methods_are_those_that_the_documentation_names():
@@ -319,7 +285,7 @@ class TestDownstream:
             assert any(
                 "ignores the distortion" in check.sentence for check in posterior.diagnostics.checks
             )
-        honest = sc.sample(obs, sc.calibrate(obs, nominal(truth)), seed=1)
+        honest = sc.sample(obs, sc.calibrate(obs, nominal(truth)), seed=1, n_steps=40)
         assert not any(
             "ignores the distortion" in check.sentence for check in honest.diagnostics.checks
         )
