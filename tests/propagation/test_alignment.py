@@ -182,20 +182,6 @@ def test_what_alignment_leaves_is_that_of_sensors_that_align_and_fly(mission: st
         assert old.max() < 1e-9 < 1e-3 < found.rest_arcsec.min()
 
 
-@pytest.mark.slow
-def test_sensors_that_align_and_stare_are_as_predicted() -> None:
-    """A thousand sensors align on the same sky with noise of their own, then stare at one field."""
-    align, flight = scenes()["stare"]
-    found = propagate(POST, table(flight), n_draws=300, alignment=table(align))  # type: ignore[arg-type]
-    thetas = POST.theta_draws[:1000]
-    seen = flown(align, flight[:1], thetas, 1000)
-    np.testing.assert_allclose(found.rest_arcsec, seen["rest"], rtol=0.07)
-    after = np.hypot(found.rest_arcsec, found.alignment_arcsec)
-    np.testing.assert_allclose(after, np.hypot(seen["rest"], seen["noise"]), rtol=0.07)
-    own = propagate(POST, table(flight), n_draws=300, alignment="observed")  # type: ignore[arg-type]
-    assert own.rest_arcsec.max() < 1e-6
-
-
 def test_a_random_sky_is_the_default_and_is_said() -> None:
     align, stare = scenes()["stare"]
     frames = table(stare)
@@ -241,7 +227,9 @@ def test_a_random_sky_is_uniform_on_the_sphere_and_off_folded_places() -> None:
     assert np.all(sky.xy.max(axis=0) > 1022.0) and np.all(sky.xy.max(axis=0) <= 1023.0)
     counts = np.diff(sky.frame_starts)
     assert len(counts) == 600 and set(counts) == {5, 11} and abs(np.mean(counts == 5) - 0.5) < 0.08
-    assert set(sky.sigma_px) == set(like.sigma_px) and set(sky.mag) == set(like.mag)
+    # Noise and magnitude are those of one star.
+    assert set(sky.mag) == set(like.mag)
+    np.testing.assert_array_equal(sky.sigma_px, sky.mag + 1.0)
     # A draw that folds beyond 267 px keeps stars away from there; one that is defined nowhere
     # leaves no place.
     wide.draws[7, 3] = -1.0 / (3.0 * 400.0**2)

@@ -14,11 +14,11 @@ from starcal_uq.propagation.onboard_error import side_by_side
 from tests.helpers.effects import breathing, bump, nearest, sheet, table, together
 from tests.helpers.outside import attitude_errors, campaign
 
-SHORT = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 200}
+SHORT = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 100}
 
 
 def calibrated(seed: int, n_frames: int, field_px: float, frame_px: float):
-    """Observations, posterior, and 200 new frames of the same sensor without noise; and its axes
+    """Observations, posterior, and 100 new frames of the same sensor without noise; and its axes
     against those of the camera nearest to it, arcsec.
     """
     rng = np.random.default_rng(seed)
@@ -27,7 +27,7 @@ def calibrated(seed: int, n_frames: int, field_px: float, frame_px: float):
         rng, n_frames=n_frames, displaced=together(field, breathing(rng, n_frames, frame_px))
     )
     flown = campaign(
-        rng, n_frames=200, sigma_px=0.0, displaced=together(field, breathing(rng, 200, frame_px))
+        rng, n_frames=100, sigma_px=0.0, displaced=together(field, breathing(rng, 100, frame_px))
     )
     obs = table(c)
     cal = sc.calibrate(obs, sheet(c), effects="field,frame")
@@ -42,17 +42,17 @@ def test_the_rest_of_new_frames_is_that_of_a_sensor_with_a_field_and_frames_of_i
     for name in ("coefficients", "covariance", "cross"):
         np.testing.assert_array_equal(getattr(again.effects, name), getattr(post.effects, name))
     frames = table(flown).with_origin(frames="the mission")
-    found = sc.propagate(again, frames, alignment=frames, calibrated=obs, n_draws=60)
+    found = sc.propagate(again, frames, alignment=frames, calibrated=obs, n_draws=30)
     errors = attitude_errors(flown, post.mean) - axes
     common = errors.mean(axis=0)
     rest = np.sqrt(np.mean((errors - common) ** 2, axis=0))
     np.testing.assert_allclose(found.rest_arcsec / rest, 1.0, atol=0.3)
     assert np.abs(common / found.common_arcsec).max() < 3.5
     # Controls: parameters alone state far too little, and what is uploaded of a field is less.
-    blind = sc.propagate(replace(post, effects=None), frames, alignment=frames, n_draws=60)
+    blind = sc.propagate(replace(post, effects=None), frames, alignment=frames, n_draws=30)
     assert (blind.rest_arcsec < 0.7 * rest).all()
     assert not blind.variants
-    aboard = sc.propagate(again, frames, alignment=frames, onboard="effects", n_draws=60)
+    aboard = sc.propagate(again, frames, alignment=frames, onboard="effects", n_draws=30)
     assert (aboard.rest_arcsec < found.rest_arcsec).all()
     model, effects = found.variants
     np.testing.assert_array_equal(model.rest_arcsec, found.rest_arcsec)
