@@ -171,11 +171,9 @@ def rest(
     error = bare(cal, obs, seen)
     diagnosis = asked(obs, cal)
     found = with_misfit(error, diagnosis, normal_posterior(cal), obs).misfit
-    assert found is not None
     own = calibrated(c, effects=effects)
     post = normal_posterior(own)
     taken = own.effects
-    assert taken is not None
     with_effects = Extended(own.camera, own.covariance, taken, own.provenance)
     return Rest(
         apart(flown, cal.theta),
@@ -261,7 +259,6 @@ def test_of_a_drift_all_but_what_imitates_a_turn_is_determined() -> None:
         effects = diagnosis.extended.effects
         assert effects.names == ("temperature",)
         found = with_misfit(error, diagnosis, post, obs).misfit
-        assert found is not None
         alone = extended_error(error, of_focal_length_alone(diagnosis.extended), post, obs)
         true.append(apart(flown, cal.theta))
         stated.append(found.rest_arcsec)
@@ -324,7 +321,6 @@ def test_what_cannot_be_assessed_is_not_stated_and_files_keep_what_was() -> None
     plain = to_plain(found)
     again = from_plain(Diagnosis, plain)
     once_more = with_misfit(error, again, post, obs).misfit
-    assert once_more is not None
     np.testing.assert_array_equal(once_more.rest_arcsec, stated.misfit.rest_arcsec)
     old = {name: value for name, value in plain.items() if name not in ("extended", "assessed")}
     old["misfit"] = plain["misfit"] | {"pattern": {"families": ["field cells"]}}

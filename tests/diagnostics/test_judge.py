@@ -27,54 +27,16 @@ from tests.helpers.scenes import observations
 
 @pytest.fixture(scope="module")
 def short():
-    """60 frames, their calibration, and posteriors of runs that are too short to be sure of, by
-    seed.
-    """
+    """60 frames, their calibration, and the posterior of a run that is too short to be sure of."""
     obs = observations(n_frames=60)
     cal = sc.calibrate(obs, sc.paper.paper_start())
-    return obs, cal, lambda seed: sc.sample(obs, cal, seed=seed, n_steps=20)
-
-
-def two_judges_of_before(post):
-    """What `diagnostics.ok` and the report decided on when each had criteria of its own; both
-    shared the others.
-    """
-    d = post.diagnostics
-    shared = (
-        np.nanmax(d.rhat) < 1.01
-        and min(np.nanmin(d.ess_bulk), np.nanmin(d.ess_tail)) > 400
-        and d.psis_khat < 0.7
-    )
-    differ = max(d.agreement_mean, d.agreement_sd)
-    of_draws = differ <= 0.05 + 4.0 * np.sqrt(1.0 / np.nanmin(d.ess_bulk) + 1.0 / d.psis_ess)
-    return shared and of_draws, shared and differ <= 0.05
-
-
-def agreements(short, seeds):
-    """Whether both judges of before, and both readers of today, agree on each short run."""
-    obs, cal, sampled = short
-    of_data = set(judge(obs, cal).checks)
-    before, today = [], []
-    for seed in seeds:
-        post = sampled(seed)
-        of_draws = [check for check in judge(obs, cal, post).checks if check not in of_data]
-        first, second = two_judges_of_before(post)
-        before.append(first == second)
-        today.append(post.diagnostics.ok == (worst(of_draws) is not Level.FAIL))
-    return before, today
-
-
-def test_posterior_and_verdict_agree_on_short_runs(short):
-    before, today = agreements(short, (0, 3, 7))
-    assert all(today)
-    # Control: two judges do not.
-    assert not all(before)
+    return obs, cal, sc.sample(obs, cal, seed=0, n_steps=20)
 
 
 @pytest.fixture(scope="module")
 def disputed(short):
     """Draws that fail a check: an importance estimate far from them."""
-    post = short[2](0)
+    post = short[2]
     changed = dataclasses.replace(
         post, diagnostics=dataclasses.replace(post.diagnostics, agreement_mean=0.9)
     )
@@ -88,7 +50,9 @@ def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_pa
     obs, cal, _ = short
     assert not disputed.diagnostics.ok and disputed.diagnostics.level.exit_status == 1
     verdict = judge(obs, cal, disputed)
-    assert set(disputed.diagnostics.checks) <= set(verdict.checks)
+    of_draws = set(verdict.checks) - set(judge(obs, cal).checks)
+    assert of_draws >= set(disputed.diagnostics.checks)
+    assert disputed.diagnostics.ok == (worst(of_draws) is not Level.FAIL)
     page = context(Results(name="run", observations=obs, calibration=cal, posterior=disputed))
     assert page["verdict"] == verdict
     html = disputed._repr_html_()
@@ -155,7 +119,7 @@ def test_checks_are_data():
 
 def test_numbers_are_judged_with_their_monte_carlo_error(short):
     """Four errors of the comparison beside the difference that would matter, and no more."""
-    post = short[2](0)
+    post = short[2]
     d = post.diagnostics
     slack = 4.0 * np.sqrt(1.0 / np.min(d.ess_bulk) + 1.0 / d.psis_ess)
     for factor, level in ((0.99, Level.PASS), (1.01, Level.FAIL)):

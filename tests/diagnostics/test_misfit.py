@@ -130,11 +130,6 @@ def test_control_noise_that_depends_on_magnitude_is_found_by_its_test_only():
     assert named(found, "decentring").p_value > 1e-3
 
 
-def test_no_structure_in_data_of_the_model():
-    found = refit(observations(n_frames=60))
-    assert found.p_value > 0.05 and found.found() == ()
-
-
 @pytest.mark.parametrize(
     ("model", "term", "value"), [("brown3", "k3", 1.0), ("brown_tangential", "p2", -0.06)]
 )
@@ -261,7 +256,7 @@ def test_stated_noise_whitens_the_tests():
     assert test.amplitudes[0].value == pytest.approx(0.2, abs=5 * test.amplitudes[0].sigma + 0.01)
 
 
-@pytest.mark.parametrize("model", ["none", "brown3", "brown_tangential", "inverse"])
+@pytest.mark.parametrize("model", ["none", "brown", "brown3", "brown_tangential", "inverse"])
 def test_every_model_is_tested_for_the_terms_it_lacks(model):
     found = refit(observations(model, n_frames=30), model)
     text = " ".join(test.name for test in found.tests)
@@ -269,7 +264,8 @@ def test_every_model_is_tested_for_the_terms_it_lacks(model):
     for name in ("k1", "k2", "k3", "p1", "p2"):
         lacking = name in known and name not in camera(model).parameter_names
         assert (f"{name}," in text or f"{name})" in text) == lacking
-    assert found.p_value > 1e-3
+    # Data of the model have no structure.
+    assert found.p_value > 0.01 and found.found() == ()
 
 
 def test_one_frame_and_few_stars_leave_out_what_cannot_be_tested():

@@ -76,7 +76,7 @@ def test_further_quantities_are_scaled_too() -> None:
     assert found.diagnosis[-2:] == (CONFLICT, FINE)
     # Units do not matter.
     assert found.prior[-1] == pytest.approx(found.prior[2], rel=1e-6)
-    with pytest.raises(PriorError, match="one value for each"):
+    with pytest.raises(PriorError):
         prior_sensitivity(post, {"x": np.zeros(3)})
 
 

@@ -105,7 +105,7 @@ def test_improper_priors_are_refused(change: dict[str, object], match: str) -> N
 
 
 def test_priors_of_another_model_are_refused() -> None:
-    with pytest.raises(PriorError, match="p1"):
+    with pytest.raises(PriorError):
         Priors.default(CAMERA).mean(["x0", "p1"])
 
 

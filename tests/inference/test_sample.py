@@ -62,13 +62,19 @@ def sentence_of(post: Any, name: str, level: Level | None = None) -> str:
 
 def test_known_posterior_is_recovered_at_extreme_scales() -> None:
     cal = gaussian_calibration()
-    post = sample(None, cal, sigma=0.05, seed=1, evaluation="compressed")
+    post = sample(None, cal, seed=1, evaluation="compressed")
     mean, covariance = conjugate(post.priors, cal)
     z = whitened(post.theta_draws, mean, covariance)
     assert np.max(np.abs(z.mean(axis=0))) < 0.04
     assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.05
-    assert np.allclose(post.laplace.covariance, covariance, rtol=1e-4)
-    assert post.diagnostics.ok, post.diagnostics.checks
+    assert np.allclose(post.laplace.covariance[:5, :5], covariance, rtol=1e-3)
+    # The default settings give ten thousand effective draws.
+    d = post.diagnostics
+    assert d.ok, d.checks
+    assert min(np.min(d.ess_bulk), np.min(d.ess_tail)) > 10_000
+    assert np.max(d.autocorrelation) < 4.0
+    assert d.psis_khat < 0.5
+    assert "gives the same" in sentence_of(post, "Independent posterior")
 
 
 def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
@@ -100,17 +106,6 @@ def test_noise_has_the_posterior_found_by_quadrature() -> None:
     cumulative = integrate.cumulative_trapezoid(density, s, initial=0.0)
     u = np.interp(post.sigma_draws, s, cumulative)
     assert np.max(np.abs(np.histogram(u, np.linspace(0, 1, 11))[0] / len(u) - 0.1)) < 0.012
-
-
-def test_defaults_give_ten_thousand_effective_draws() -> None:
-    post = sample(None, gaussian_calibration(), seed=5, evaluation="compressed")
-    d = post.diagnostics
-    assert d.ok, d.checks
-    assert np.min(d.ess_bulk) > 10_000
-    assert np.min(d.ess_tail) > 10_000
-    assert np.max(d.autocorrelation) < 4.0
-    assert d.psis_khat < 0.5
-    assert "gives the same" in sentence_of(post, "Independent posterior")
 
 
 @pytest.mark.slow
@@ -243,15 +238,15 @@ def test_settings_that_cannot_work_are_refused(options: dict[str, Any], match: s
 
 
 def test_unsound_calibrations_are_refused() -> None:
-    with pytest.raises(SamplingError, match="did not converge"):
-        sample(None, gaussian_calibration(status=Status.STALLED), **QUICK)
-    with pytest.raises(SamplingError, match="not positive definite"):
-        sample(None, gaussian_calibration(information=-symmetric_inverse(COVARIANCE)), **QUICK)
-    priors = Priors.default(gaussian_calibration().nominal.replace(distortion="k1"))
-    with pytest.raises(SamplingError, match=r"priors are a dict: .* Priors\.default"):
-        sample(None, gaussian_calibration(), {"f": (70.0, 0.1)}, **QUICK)  # type: ignore[arg-type]
-    with pytest.raises(SamplingError, match=r"Priors\.default"):
-        sample(None, gaussian_calibration(), priors, **QUICK)
+    cal, negative = gaussian_calibration(), -symmetric_inverse(COVARIANCE)
+    for given, words in (
+        ((gaussian_calibration(status=Status.STALLED),), "did not converge"),
+        ((gaussian_calibration(information=negative),), "not positive definite"),
+        ((cal, {"f": (70.0, 0.1)}), r"priors are a dict: .* Priors\.default"),
+        ((cal, Priors.default(cal.nominal.replace(distortion="k1"))), r"Priors\.default"),
+    ):
+        with pytest.raises(SamplingError, match=words):
+            sample(None, *given, **QUICK)
 
 
 def test_starts_without_density_are_refused() -> None:

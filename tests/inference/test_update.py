@@ -140,7 +140,7 @@ def test_prior_widens_by_inflation_and_allowed_shift() -> None:
     ):
         with pytest.raises(PriorError, match=match):
             prior_from(ground(), **options)
-    with pytest.raises(PriorError, match="zero or more"):
+    with pytest.raises(PriorError):
         AllowedShift(principal_point_px=-1.0)
 
 
@@ -230,12 +230,12 @@ def test_shift_test_sees_what_moved() -> None:
 
 
 def test_shift_test_refuses_what_is_not_independent() -> None:
-    with pytest.raises(PriorError, match="same observations"):
-        shift_test(calibrated(1), calibrated(1))
     chained = sample(None, calibrated(2), prior_from(ground()), seed=2, n_steps=20)
-    with pytest.raises(PriorError, match="test its calibration"):
-        shift_test(calibrated(3), chained)
-    with pytest.raises(PriorError, match="do not compare"):
-        shift_test(
-            calibrated(1), calibrate(scenes.observations("k1"), scenes.nominal(scenes.camera("k1")))
-        )
+    other = calibrate(scenes.observations("k1"), scenes.nominal(scenes.camera("k1")))
+    for before, after, words in (
+        (calibrated(1), calibrated(1), "same observations"),
+        (calibrated(3), chained, "test its calibration"),
+        (calibrated(1), other, "do not compare"),
+    ):
+        with pytest.raises(PriorError, match=words):
+            shift_test(before, after)
