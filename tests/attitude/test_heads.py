@@ -145,14 +145,13 @@ def test_far_attitudes_meet_in_the_middle():
 
 def test_wrong_arrays_are_refused(pair):
     _, q = measured(MOUNTINGS, COVARIANCES, seed=6, size=3)
-    with pytest.raises(HeadError, match=r"give \(heads, frames, 4\), with 2 heads"):
-        pair.fuse(q[:1], COVARIANCES[:, None])
-    with pytest.raises(HeadError, match="covariances have shape"):
-        pair.fuse(q, COVARIANCES[:, 0])
-    with pytest.raises(HeadError, match="not positive"):
-        pair.fuse(q, np.zeros((2, 1, 3, 3)))
-    with pytest.raises(HeadError, match="a name of its own"):
-        sc.attitude.HeadArray(("A", "A"), MOUNTINGS)
+    for given, words in (
+        ((q[:1], COVARIANCES[:, None]), r"give \(heads, frames, 4\), with 2 heads"),
+        ((q, COVARIANCES[:, 0]), "covariances have shape"),
+        ((q, np.zeros((2, 1, 3, 3))), "not positive"),
+    ):
+        with pytest.raises(HeadError, match=words):
+            pair.fuse(*given)
 
 
 FILE = """

@@ -11,7 +11,7 @@ from starcal_uq.attitude.mountings import misalignments
 from starcal_uq.core.errors import HeadError
 
 ARCSEC = 648_000.0 / np.pi
-FRAMES, CAMPAIGNS = 40, 250
+FRAMES, CAMPAIGNS = 40, 120
 NOMINAL = np.stack([
     np.eye(3),
     Rotation.from_euler("y", 90.0, degrees=True).as_matrix(),
@@ -58,9 +58,9 @@ def test_mountings_and_drift_are_found_as_well_as_stated():
         squares.append(error[free] @ np.linalg.solve(inside, error[free]) / len(free))
         covered.append(np.abs(error[free]) < 1.96 * np.sqrt(np.diag(inside)))
         ratios.append(found.test.ratio)
-    # Two standard errors of the mean square are 0.05.
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.05)
-    assert np.mean(covered) == pytest.approx(0.95, abs=0.015)
+    # Two standard errors of the mean square are 0.075, of a share 0.012.
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.075)
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.02)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
 
 
@@ -111,14 +111,14 @@ def test_another_reference_is_the_same_solution():
 
 def test_what_frames_do_not_tell_is_refused():
     q, warmth, _ = campaign(np.random.default_rng(15))
-    with pytest.raises(HeadError, match="temperature_c never changes"):
-        misalignments(HEADS, q, COVARIANCE, np.full(FRAMES, 20.0))
-    with pytest.raises(HeadError, match="give a number for each of 40 frames"):
-        misalignments(HEADS, q, COVARIANCE, warmth[:-1])
-    with pytest.raises(HeadError, match="head 'D' is unknown"):
-        misalignments(HEADS, q, COVARIANCE, reference="D")
-    with pytest.raises(HeadError, match="one head alone"):
-        misalignments(sc.attitude.HeadArray(("A",), NOMINAL[:1]), q[:1], COVARIANCE[:1])
-    q[2] = np.nan
-    with pytest.raises(HeadError, match="too few frames in common"):
-        misalignments(HEADS, q, COVARIANCE, warmth)
+    alone = sc.attitude.HeadArray(("A",), NOMINAL[:1])
+    blind = np.where(np.arange(3)[:, None, None] == 2, np.nan, q)
+    for given, options, words in (
+        ((HEADS, q, COVARIANCE, np.full(FRAMES, 20.0)), {}, "temperature_c never changes"),
+        ((HEADS, q, COVARIANCE, warmth[:-1]), {}, "give a number for each of 40 frames"),
+        ((HEADS, q, COVARIANCE), {"reference": "D"}, "head 'D' is unknown"),
+        ((alone, q[:1], COVARIANCE[:1]), {}, "one head alone"),
+        ((HEADS, blind, COVARIANCE, warmth), {}, "too few frames in common"),
+    ):
+        with pytest.raises(HeadError, match=words):
+            misalignments(*given, **options)

@@ -147,10 +147,9 @@ def test_priors_determine_what_the_data_leave_open():
     assert cal.status is Status.SINGULAR and cal.undetermined == ("x0", "y0")
     short = {"seed": 0, "n_ensembles": 2, "n_walkers": 14, "n_steps": 60}
     priors = sc.Priors.default(cal.nominal)
-    with pytest.raises(SamplingError, match="or priors that determine x0 and y0"):
-        sc.sample(obs, cal, **short)
-    with pytest.raises(SamplingError, match="or priors that determine x0 and y0"):
-        sc.sample(obs, cal, priors=priors.replace(principal_point_px=1000.0), **short)
+    for wide in (None, priors.replace(principal_point_px=1000.0)):
+        with pytest.raises(SamplingError, match="or priors that determine x0 and y0"):
+            sc.sample(obs, cal, priors=wide, **short)
     post = sc.sample(obs, cal, priors=priors.replace(principal_point_px=10.0), **short)
     assert np.all(np.abs(post.mean[:3] - c.theta[:3]) < 4.0 * post.sd[:3])
     # Of the point it knows what the priors say, of f what the stars do.
@@ -191,7 +190,7 @@ def narrow_fields(n: int) -> tuple[list[str], np.ndarray]:
 
 @pytest.mark.slow
 def test_noise_in_the_distortion_of_a_narrow_field_tells_no_principal_point(monkeypatch):
-    models, z = narrow_fields(40)
+    models, z = narrow_fields(25)
     assert np.sqrt(np.mean(z**2)) < 1.3
     # Believed, it does: many estimates come with sigmas that are too small.
     monkeypatch.setattr(

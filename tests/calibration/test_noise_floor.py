@@ -37,7 +37,6 @@ def test_floor_and_scale_are_found(floor_px: float, scale: float) -> None:
     assert settled.meta["noise_floor_px"] == pytest.approx(floor_px, rel=0.1)
     cal = sc.calibrate(settled, nominal(camera()))
     assert cal.sigma == pytest.approx(scale, rel=0.06)
-    assert settled.sigma_px is not None
     # Bright stars now scatter as they state; without the floor they do not.
     assert _pulls(cal, settled, bright := obs.sigma_px < 0.02) == pytest.approx(1.0, abs=0.25)
     assert _pulls(sc.calibrate(obs, nominal(camera())), obs, bright) > 1.5
@@ -46,7 +45,6 @@ def test_floor_and_scale_are_found(floor_px: float, scale: float) -> None:
 def test_noise_below_the_floor_is_not_blown_up() -> None:
     """Where stars state far too much, as of JPEG images, the noise is the scatter seen."""
     settled = settle_noise(obs := measured(0.2, 0.05), sc.calibrate(obs, nominal(camera())))
-    assert settled.sigma_px is not None
     assert np.median(settled.sigma_px) == pytest.approx(0.2, rel=0.05)
     assert sc.calibrate(settled, nominal(camera())).sigma == pytest.approx(1.0, abs=0.03)
 
@@ -62,14 +60,14 @@ def _pulls(cal: sc.Calibration, obs: sc.Observations, chosen: np.ndarray) -> flo
 @pytest.mark.slow
 def test_errors_are_what_the_covariance_says_once_the_floor_is_known() -> None:
     truth, with_floor, without = camera().theta, [], []
-    for seed in range(60):
+    for seed in range(40):
         obs = measured(0.04, seed=seed, n_frames=30)
         plain = sc.calibrate(obs, nominal(camera()))
         settled = sc.calibrate(settle_noise(obs, plain), nominal(camera()))
         for cal, squares in ((settled, with_floor), (plain, without)):
             off = cal.theta - truth
             squares.append(off @ np.linalg.solve(cal.covariance, off) / len(off))
-    # 300 squared errors: one sigma of their mean is 8 %. The control is the same stars
+    # 200 squared errors: one sigma of their mean is 10 %. The control is the same stars
     # without a floor.
     assert np.mean(with_floor) == pytest.approx(1.0, abs=0.25)
     assert np.mean(without) > 2.0
@@ -89,7 +87,6 @@ def test_noise_as_stated_has_no_floor() -> None:
 
 def test_wrong_stars_make_no_floor() -> None:
     obs = measured(0.0, n_frames=40)
-    assert obs.sigma_px is not None
     # As far off as the gate of the identification lets pass.
     wrong = replace(
         obs,
@@ -110,5 +107,5 @@ def test_what_is_not_needed_changes_nothing() -> None:
 
 def test_unstated_noise_is_refused() -> None:
     obs = replace(observations(n_frames=12), sigma_px=None)
-    with pytest.raises(sc.errors.CalibrationError, match="sigma_px"):
+    with pytest.raises(sc.errors.CalibrationError):
         noise_floor(sc.calibrate(obs, nominal(camera())), obs)

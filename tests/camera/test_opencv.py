@@ -76,5 +76,5 @@ def test_two_focal_lengths_and_skew_of_opencv_are_axes_of_the_detector():
 
 
 def test_inverse_model_has_no_opencv_form():
-    with pytest.raises(CameraError, match="OpenCV"):
+    with pytest.raises(CameraError):
         awkward("inverse").to_opencv()

@@ -6,7 +6,9 @@ import logging
 import os
 import signal
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,23 +76,25 @@ def test_no_scheduler_is_said_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -
             pass
 
 
+@contextmanager
+def of_dask(level: int) -> Iterator[Any]:
+    """A client of two workers on this machine, which log from this level on."""
+    distributed = pytest.importorskip("distributed")
+    workers = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+    with (
+        distributed.LocalCluster(**workers, silence_logs=level) as local,
+        distributed.Client(local) as client,
+    ):
+        yield client
+
+
 @pytest.fixture(scope="module", params=["processes", "Dask"])
 def several(request: pytest.FixtureRequest) -> Iterator[Cluster]:
     if request.param == "processes":
         with cluster(workers=2, caller="a test") as processes:
             yield processes
         return
-    distributed = pytest.importorskip("distributed")
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.ERROR,
-        ) as local,
-        distributed.Client(local) as client,
-        cluster(client) as processes,
-    ):
+    with of_dask(logging.ERROR) as client, cluster(client) as processes:
         yield processes
 
 
@@ -103,10 +107,9 @@ def test_processes_give_the_bits_of_one(several: Cluster) -> None:
     ) == Cluster().reduce(share, numbers, total)
     assert steps[-1] == (40, 40)
     assert several.map(share, numbers) == [share(n) for n in numbers]
-    with pytest.raises(ClusterError, match=r"^number 2 fails.$"):
-        several.map(failing, numbers)
-    with pytest.raises(ClusterError, match=r"^number 2 fails.$"):
-        several.reduce(failing, numbers, sum)
+    for call in (several.map, lambda *given: several.reduce(*given, sum)):
+        with pytest.raises(ClusterError, match=r"^number 2 fails.$"):
+            call(failing, numbers)
 
 
 @pytest.mark.slow
@@ -124,15 +127,8 @@ def test_workers_that_die_again_are_said_in_one_sentence() -> None:
         cluster(workers=2, caller="a test") as processes,
     ):
         processes.map(always_dying, [0])
-    distributed = pytest.importorskip("distributed")
     with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        ) as local,
-        distributed.Client(local) as client,
+        of_dask(logging.CRITICAL) as client,
         pytest.raises(ClusterError, match="more memory, or smaller partitions"),
         cluster(client) as workers,
     ):

@@ -44,10 +44,7 @@ def test_every_public_function_refuses_settings_outside_their_limits():
 
 
 def test_errors_of_settings_are_errors_of_values():
-    with pytest.raises(ValueError, match=r"^seed is -1: give a whole number from 0 to"):
-        sc.simulate(None, None, seed=-1)
-    with pytest.raises(StarcalError, match="n_frames is 0: give a whole number from 1 to"):
-        sc.simulate(None, None, n_frames=0)
+    assert issubclass(SettingError, ValueError) and issubclass(SettingError, StarcalError)
 
 
 def test_counts_that_no_memory_holds_are_refused_before_it_is_taken(monkeypatch):

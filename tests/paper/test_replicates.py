@@ -33,8 +33,8 @@ SMALL = {"methods": PAIRS, "n_frames": 12, "seed": 4}
 
 @pytest.fixture(scope="module")
 def found():
-    """A dozen data sets of twenty frames, by every method."""
-    return replicate(n_replicates=12, n_frames=20, seed=5, workers=0)
+    """Eight data sets of twenty frames, by every method."""
+    return replicate(n_replicates=8, n_frames=20, seed=5, workers=0)
 
 
 def artificial(error, claimed, truth=None, classical=None):
@@ -100,17 +100,15 @@ def test_efficiency_and_ratio_say_what_they_should():
 
 
 def test_chance_is_not_called_a_finding():
-    """Fifty tables of honest methods: one in a hundred may object; single tests object in nearly
-    all.
-    """
+    """Of 25 tables of honest methods one in a hundred may object; single tests object in nearly all."""
     rng = np.random.default_rng(3)
     objections, single = 0, 0
-    for _ in range(50):
+    for _ in range(25):
         table = artificial(rng.standard_normal((7, 100, 5)), 1.0).table()
         objections += bool((table["verdict"] != HONEST).any())
         single += bool((table[["bias_p", "claimed_p", "coverage95_p"]] < 0.05).to_numpy().any())
-    assert objections <= 2
-    assert single > 45
+    assert objections <= 1
+    assert single > 22
 
 
 def test_wrong_methods_are_called_by_their_fault():
@@ -250,9 +248,6 @@ def test_a_method_that_fails_is_counted(monkeypatch):
     assert "No result from efficient in 1." in found.text
 
 
-# --- workers, interrupts ---
-
-
 # --- surface ---
 
 
@@ -287,16 +282,16 @@ def test_table(found):
         "coverage95_high verdict"
     )
     assert set(wanted.split()) <= set(table.columns)
-    assert (table["n"] == 12).all()
+    assert (table["n"] == 8).all()
     assert (table["claimed_over_spread_low"] < table["claimed_over_spread"]).all()
     assert (table["coverage95_low"] <= table["coverage95"]).all()
     known = table["claimed_classical"].notna()
     assert set(table["method"][~known]) == {"samaan", "samaan, diagonal", "efficient"}
     assert set(table["parameter"][~known & (table["method"] != "efficient")]) == {"k1", "k2"}
     assert (table["verdict_classical"][known] != "").all()
-    with pytest.raises(ValueError, match="has no estimate of 'k1'"):
+    with pytest.raises(ValueError):
         found.row("griffith", "k1")
-    with pytest.raises(ValueError, match="there is no method 'guess'"):
+    with pytest.raises(ValueError):
         found.n_failed("guess")
 
 
@@ -313,10 +308,10 @@ def test_accuracy_over_the_field(found):
 
 @pytest.fixture(scope="module")
 def many():
-    """120 data sets of fifty frames, by every method: a spread is known to 6.5 %, a bias to a
-    tenth of it.
+    """100 data sets of fifty frames, by every method: a spread is known to 7 %, a bias to a tenth
+    of it.
     """
-    return replicate(n_replicates=120, n_frames=50, workers=1)
+    return replicate(n_replicates=100, n_frames=50, workers=0)
 
 
 @pytest.mark.slow
