@@ -50,9 +50,6 @@ def value(study, axis, at, method, parameter, column):
     return float(rows[column][rows["value"] == at].iloc[0])
 
 
-# --- points ---
-
-
 def test_crossing():
     at = np.array([1.0, 10.0, 100.0])
     assert crossing(at, np.array([0.1, 1.0, 10.0])) == ("above", pytest.approx(10.0))
@@ -116,9 +113,6 @@ def test_a_field_beyond_the_catalogue_says_so(monkeypatch):
         deep_catalogue(sc.paper.paper_camera(), 6.0, 6.0, (5.0,))
 
 
-# --- estimates ---
-
-
 def test_shared_stages_are_the_methods():
     """One calibration stands for three methods: each of them, called by its name, gives the
     same.
@@ -179,9 +173,6 @@ def test_save_and_load_lose_nothing(study, tmp_path):
     assert again.text == dataclasses.replace(study, provenance={}).text
     study.save_csv(path)
     assert [p.name for p in tmp_path.iterdir()] == ["interaction.csv"]
-
-
-# --- statistics of the methods ---
 
 
 @pytest.fixture(scope="module")

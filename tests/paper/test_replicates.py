@@ -65,9 +65,6 @@ def artificial(error, claimed, truth=None, classical=None):
     )
 
 
-# --- statistics ---
-
-
 def test_interval_of_a_spread_covers():
     rng = np.random.default_rng(1)
     n, trials = 30, 4000
@@ -94,9 +91,6 @@ def test_efficiency_and_ratio_say_what_they_should():
     assert row["rmse"] == pytest.approx(np.hypot(3.0, 2.0), rel=0.02)
     assert row["efficiency_low"] < row["efficiency"] < row["efficiency_high"]
     assert np.isnan(row["claimed_classical_over_spread"])
-
-
-# --- verdicts ---
 
 
 def test_chance_is_not_called_a_finding():
@@ -147,9 +141,6 @@ def test_few_replicates_are_no_verdict():
     found = artificial(np.random.default_rng(6).standard_normal((1, 20, 5)), 0.3)
     assert set(found.table()["verdict"]) == {TOO_FEW}
     assert "too few to judge" in found.text
-
-
-# --- one replicate ---
 
 
 def test_bound_is_that_of_the_marginal_information():
@@ -248,9 +239,6 @@ def test_a_method_that_fails_is_counted(monkeypatch):
     assert "No result from efficient in 1." in found.text
 
 
-# --- surface ---
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -301,9 +289,6 @@ def test_accuracy_over_the_field(found):
     assert rms["least squares"] > 10 * rms["efficient"]
     # A pixel is 35 arcsec.
     np.testing.assert_allclose(found.map_arcsec / found.map_px, 35.1, rtol=0.02)
-
-
-# --- statistics of the methods ---
 
 
 @pytest.fixture(scope="module")

@@ -65,9 +65,6 @@ def points(n: int = 40, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.0, 1023.0, (n, 2))
 
 
-# --- what is printed
-
-
 def test_the_cameras_are_those_of_the_paper() -> None:
     for convention, model in (("eq14", "brown"), ("eq6", "inverse")):
         camera, start = paper_camera(convention), paper_start(convention)
@@ -88,9 +85,6 @@ def test_numbers_are_kept_as_printed() -> None:
     assert printed(LEAST_SQUARES, "y0_px").unit_in_last_place == pytest.approx(0.01)
     with pytest.raises(KeyError):
         printed(LEAST_SQUARES, "k1")
-
-
-# --- measures of error
 
 
 def undistorted_by_hand(camera: sc.Camera, xy: np.ndarray, how: str) -> np.ndarray:
@@ -201,9 +195,6 @@ def detector_mean_of_tenth_power() -> float:
     """Mean of (u^2 + v^2)^5 over the square, by the binomial theorem."""
     choose = (1, 5, 10, 10, 5, 1)
     return sum(c / ((2 * i + 1) * (2 * (5 - i) + 1)) for i, c in enumerate(choose))
-
-
-# --- readings
 
 
 @pytest.mark.parametrize(("convention", "focal_mm"), [("eq14", 70.211), ("eq6", 70.242)])
@@ -340,9 +331,6 @@ def test_judgement_over_seeds() -> None:
     assert accepted[6.0] <= 6
 
 
-# --- the paper against itself
-
-
 def test_the_paper_against_itself() -> None:
     xy, weight = detector_grid(TRUTH, 65)
     ideal = undistorted(TRUTH, xy)
@@ -367,9 +355,6 @@ def test_the_paper_against_itself() -> None:
     exact = {m: dict.fromkeys(values, 0.0) for m, values in sigmas.items()}
     assert all(check.agrees != WITHIN_NOISE for check in paper_checks(TRUTH, points(100), exact))
     assert printed_camera(TRUTH, LEAST_SQUARES).distortion == "none"
-
-
-# --- the whole
 
 
 @pytest.fixture(scope="module")
