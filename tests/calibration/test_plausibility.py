@@ -13,7 +13,7 @@ from starcal_uq.calibration import plausibility
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.paper.recursive.folder import filter_run
-from tests.helpers.outside import campaign
+from tests.helpers.outside import campaign, sky_angles
 
 FIELDS = (8.0, 45.0)
 # Clauses that blame the table or the camera file.
@@ -249,8 +249,7 @@ def test_control_a_field_near_the_pole_and_one_near_the_equinox():
         r = sc.Observations(**c.columns).directions_icrs @ (turn @ c.attitudes[0]).T
         mine = c.columns["frame"] == 0
         columns = {name: c.columns[name][mine] for name in ("frame", "x_px", "y_px")}
-        columns["ra_deg"] = np.degrees(np.arctan2(r[mine, 1], r[mine, 0])) % 360.0
-        columns["dec_deg"] = np.degrees(np.arcsin(r[mine, 2]))
+        columns["ra_deg"], columns["dec_deg"] = sky_angles(r[mine])
         frames.append(columns)
     for columns in frames:
         assert (

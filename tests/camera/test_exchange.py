@@ -14,6 +14,7 @@ import starcal_uq as sc
 from starcal_uq.camera.exchange import CAMERA_FORMATS, export_camera
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import CameraError, RunFolderError
+from tests.helpers.outside import unit_vectors
 
 F = 5116.0
 CAMERAS = {
@@ -143,8 +144,7 @@ def test_a_header_with_sip_gives_the_angles_between_pixels(camera, tmp_path):
 
     made = export_camera(camera, "sip", tmp_path / "c.hdr")
     wcs = WCS(Header.fromtextfile(made.path))
-    ra, dec = np.radians(wcs.all_pix2world(pixels(camera), 0)).T
-    theirs = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    theirs = unit_vectors(*wcs.all_pix2world(pixels(camera), 0).T)
     seen = unproject(camera, pixels(camera))
     # The rotation between them, which must be none of a mirror.
     u, _, v = np.linalg.svd(theirs.T @ seen)

@@ -8,6 +8,7 @@ import pytest
 from starcal_uq.camera.sip import sip_header
 from starcal_uq.core.errors import CameraError
 from tests.camera.test_exchange import CAMERAS, largest, pixels
+from tests.helpers.outside import unit_vectors
 
 
 @pytest.fixture(params=CAMERAS.values(), ids=CAMERAS)
@@ -31,8 +32,7 @@ def test_world_coordinates_of_a_frame_are_those_of_the_camera(camera):
         )
         sky = camera.unproject(pixels(camera)) @ rotation
         wcs = camera.wcs(attitude, tolerance_px=1.0)
-        ra, dec = np.radians(wcs.all_pix2world(pixels(camera), 0)).T
-        theirs = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+        theirs = unit_vectors(*wcs.all_pix2world(pixels(camera), 0).T)
         _, error = sip_header(camera)
         assert largest(camera.focal_px * (theirs - sky)) < 2.0 * error + 1e-5
     # A rotation of the camera by the thousandth part of a radian is seen.

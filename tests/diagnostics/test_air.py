@@ -18,6 +18,7 @@ from tests.helpers.outside import (
     cap,
     frame_at,
     random_unit,
+    sky_angles,
     through_air,
     zeniths_of_frames,
 )
@@ -68,7 +69,7 @@ def night(
         )
         r /= np.linalg.norm(r, axis=1)[:, None]
         time = (datetime(2026, 11, 13, 12) + timedelta(seconds=float(seconds[frame]))).isoformat()
-        ra, dec = np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0, np.degrees(np.arcsin(r[:, 2]))
+        ra, dec = sky_angles(r)
         values = (np.full(len(inside), frame), *xy[:, inside], ra, dec, np.full(len(inside), time))
         for column, found in zip(columns.values(), values, strict=True):
             column.append(found)

@@ -17,7 +17,7 @@ from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import View, shapes
 from starcal_uq.observations.frames import StarFrames
-from tests.helpers.outside import campaign
+from tests.helpers.outside import campaign, sky_angles
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 from verification import regimes
 from verification.misfit_power import SCENARIOS, main, power
@@ -181,18 +181,14 @@ def test_a_pattern_of_the_detectable_size_is_found_nine_times_in_ten():
 def test_aberration_is_measured_as_a_velocity():
     obs = observations(n_frames=200)
     velocity = np.array([20.0, -15.0, 10.0])
-    ra, dec = (np.degrees(v) for v in _angles(sc.sky.aberrate(obs.directions_icrs, -velocity)))
-    found = refit(dataclasses.replace(obs, ra_deg=ra % 360.0, dec_deg=dec))
+    ra, dec = sky_angles(sc.sky.aberrate(obs.directions_icrs, -velocity))
+    found = refit(dataclasses.replace(obs, ra_deg=ra, dec_deg=dec))
     test = named(found, "aberration")
     assert test.p_holm < 1e-6
     for amplitude, true in zip(test.amplitudes, velocity, strict=True):
         assert amplitude.unit == "km/s"
         assert abs(amplitude.value - true) < 4.0 * amplitude.sigma
         assert amplitude.sigma < 3.0
-
-
-def _angles(r):
-    return np.arctan2(r[:, 1], r[:, 0]), np.arcsin(r[:, 2])
 
 
 def test_what_the_data_hardly_tell_apart_is_said_to_be_so():

@@ -17,7 +17,7 @@ from starcal_uq.diagnostics import time_test, unseen_aberration
 from starcal_uq.diagnostics.verdict import observed
 from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.sky.apparent import make_apparent
-from tests.helpers.outside import aberrated, campaign, frame_at
+from tests.helpers.outside import aberrated, campaign, frame_at, sky_angles
 
 DAYS, LATITUDE, LONGITUDE, EPOCH = 9813.0, 38.0, -70.0, 2026.87
 SITE = sc.sky.Site(LATITUDE, LONGITUDE)
@@ -79,8 +79,7 @@ def seen(seed, *, n_frames=30, field_deg=12.0, sigma_px=0.05, years=0.0, air=0.0
         xy += sigma_px * rng.standard_normal(xy.shape)
         inside = np.flatnonzero((xy.min(axis=0) > 0.0) & (xy.max(axis=0) < 1023.0))[:20]
         if len(inside) > 5:
-            r = table[near[inside]].T
-            ra, dec = np.degrees(np.arctan2(r[1], r[0])) % 360.0, np.degrees(np.arcsin(r[2]))
+            ra, dec = sky_angles(table[near[inside]])
             time = (datetime(2000, 1, 1, 12) + timedelta(days=days)).isoformat(timespec="seconds")
             rows.append(
                 (

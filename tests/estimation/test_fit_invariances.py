@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from tests.helpers.outside import campaign
+from tests.helpers.outside import campaign, unit_vectors
 
 SIZE = 1024
 # The same minimum by other sums: solvers end within this of it, in standard deviations.
@@ -38,10 +38,10 @@ def reference(columns):
 
 
 def turned_sky(columns, turn):
-    ra, dec = np.radians(columns["ra_deg"]), np.radians(columns["dec_deg"])
-    r = turn @ np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    sky = {"ra_deg": np.degrees(np.arctan2(r[1], r[0])) % 360.0}
-    return columns | sky | {"dec_deg": np.degrees(np.arctan2(r[2], np.hypot(r[0], r[1])))}
+    x, y, z = turn @ unit_vectors(columns["ra_deg"], columns["dec_deg"]).T
+    sky = {"ra_deg": np.degrees(np.arctan2(y, x)) % 360.0}
+    # At the pole itself an arc sine has half of the digits.
+    return columns | sky | {"dec_deg": np.degrees(np.arctan2(z, np.hypot(x, y)))}
 
 
 def another_sky(columns, rng):
@@ -51,8 +51,7 @@ def another_sky(columns, rng):
 
 def sky_at_the_pole(columns, rng):
     """The first star stands at the pole, those of its frame around it at all right ascensions."""
-    ra, dec = np.radians(columns["ra_deg"][0]), np.radians(columns["dec_deg"][0])
-    first = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    first = unit_vectors(columns["ra_deg"][:1], columns["dec_deg"][:1])[0]
     across = np.cross(first, [0.3, -0.2, 0.9])
     across /= np.linalg.norm(across)
     return turned_sky(columns, np.array([across, np.cross(first, across), first])), {}, {}

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import starcal_uq as sc
+from tests.helpers.outside import sky_angles
 
 SIDE_PX, SIGMA_PX = 1024, 0.05
 CENTRE = np.array([508.0, 515.0])
@@ -39,8 +40,7 @@ def observed(
         seen.append(b[on])
     pixels, directions = np.concatenate(xy), np.concatenate(seen)
     noisy = pixels + SIGMA_PX * rng.standard_normal(pixels.shape)
-    x, y, z = sky[np.concatenate(which)].T
-    ra, dec = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arcsin(z))
+    ra, dec = sky_angles(sky[np.concatenate(which)])
     table = sc.Observations(
         frame=np.concatenate(frame), x_px=noisy[:, 0], y_px=noisy[:, 1], ra_deg=ra, dec_deg=dec
     )

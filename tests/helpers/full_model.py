@@ -11,7 +11,7 @@ import emcee
 import numpy as np
 
 from tests.helpers.effects import CORNER_PX, projected
-from tests.helpers.outside import Campaign
+from tests.helpers.outside import Campaign, star_directions
 
 # Standard deviation of the half-normal prior of the scale, px at the corner.
 _PRIOR_PX = 10.0
@@ -25,9 +25,7 @@ def _columns(c: Campaign, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     shifts (3, 2 n) by turns, and (3, 2 n) by scale and two shears.
     """
     rows = c.columns["frame"] == frame
-    ra, dec = (np.radians(c.columns[name][rows]) for name in ("ra_deg", "dec_deg"))
-    icrs = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    b = c.attitudes[frame] @ icrs
+    b = c.attitudes[frame] @ star_directions(c)[rows].T
     seen = np.array([c.columns[name][rows] for name in ("x_px", "y_px")])
     predicted = projected(c.theta, b)
 

@@ -177,8 +177,7 @@ def campaign(
         "frame": np.concatenate(rows["frame"]),
         "x_px": np.concatenate(rows["x"]),
         "y_px": np.concatenate(rows["y"]),
-        "ra_deg": np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0,
-        "dec_deg": np.degrees(np.arcsin(r[:, 2])),
+        **dict(zip(("ra_deg", "dec_deg"), sky_angles(r), strict=True)),
         "star_id": np.array([f"S{i}" for i in np.concatenate(rows["id"])]),
         "mag": np.concatenate(rows["mag"]),
     }
@@ -238,14 +237,23 @@ def aberrated(c: Campaign, velocity_km_s: np.ndarray) -> Campaign:
     return _redirected(c, star_directions(c) + velocity_km_s / 299792.458)
 
 
-def star_directions(c: Campaign) -> np.ndarray:
-    ra, dec = np.radians(c.columns["ra_deg"]), np.radians(c.columns["dec_deg"])
+def unit_vectors(ra_deg: np.ndarray, dec_deg: np.ndarray) -> np.ndarray:
+    """Directions (n, 3)."""
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
 
+def sky_angles(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Right ascensions and declinations, degrees, of directions (n, 3)."""
+    return np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0, np.degrees(np.arcsin(r[:, 2]))
+
+
+def star_directions(c: Campaign) -> np.ndarray:
+    return unit_vectors(c.columns["ra_deg"], c.columns["dec_deg"])
+
+
 def _redirected(c: Campaign, directions: np.ndarray) -> Campaign:
-    r = directions / np.linalg.norm(directions, axis=1)[:, None]
-    ra, dec = np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0, np.degrees(np.arcsin(r[:, 2]))
+    ra, dec = sky_angles(directions / np.linalg.norm(directions, axis=1)[:, None])
     return replace(c, columns=c.columns | {"ra_deg": ra, "dec_deg": dec})
 
 

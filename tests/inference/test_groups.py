@@ -55,11 +55,6 @@ def project(theta: np.ndarray, b: np.ndarray) -> np.ndarray:
     return theta[:2] + xy * (1.0 + theta[3] * square + theta[4] * square**2)
 
 
-def directions(obs: sc.Observations) -> np.ndarray:
-    ra, dec = np.radians(obs.ra_deg), np.radians(obs.dec_deg)
-    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
-
-
 def test_groups_have_names_units_and_the_same_draws(data, post, obs):
     for group in ("posterior", "sample_stats", *GROUPS):
         dataset = data[group]
@@ -112,7 +107,7 @@ def test_log_likelihood_is_the_integral_over_the_attitude(frame, data, post, nig
     theta = np.array([float(draw[p.name]) * p.scale for p in post.parameters[:-1]])
     sigma = float(draw["sigma"])
     rows = obs.frame == obs.frame_ids[frame]
-    r, pixel = directions(obs)[rows], obs.xy[rows]
+    r, pixel = outside.unit_vectors(obs.ra_deg, obs.dec_deg)[rows], obs.xy[rows]
 
     def residuals(phi: np.ndarray) -> np.ndarray:
         turn = Rotation.from_rotvec(phi).as_matrix() @ night.attitudes[frame]
@@ -141,7 +136,8 @@ def test_log_likelihood_is_the_integral_over_the_attitude(frame, data, post, nig
 
 def test_drawn_images_are_those_of_a_second_exposure(data, post, night, obs, monkeypatch):
     rng = np.random.default_rng(8)
-    b = np.einsum("nij,nj->ni", np.repeat(night.attitudes, 5, axis=0), directions(obs))
+    seen = outside.unit_vectors(obs.ra_deg, obs.dec_deg)
+    b = np.einsum("nij,nj->ni", np.repeat(night.attitudes, 5, axis=0), seen)
     again = project(night.theta, b) + SIGMA * rng.standard_normal((len(b), 2))
 
     def inside(made: Any, share: float) -> float:

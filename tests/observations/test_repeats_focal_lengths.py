@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import starcal_uq as sc
 from starcal_uq.calibration.noise_floor import settle_noise
 from starcal_uq.core.errors import RepeatedFramesError
+from tests.helpers.outside import sky_angles
 
 SIZE, FOCAL_PX, STARS = 1024, 4000.0, 25
 
@@ -31,13 +32,13 @@ def folder(seed, factor, *, copied=False):
     focal = FOCAL_PX * np.where(np.arange(10) > 7, factor, 1.0)[:, None, None]
     ahead = np.concatenate([(places - 0.5 * (SIZE - 1)) / focal, np.ones((10, STARS, 1))], axis=2)
     sky = (ahead / np.linalg.norm(ahead, axis=2, keepdims=True) @ turns).reshape(-1, 3)
-    x, y = measured.reshape(-1, 2).T
+    (x, y), (ra, dec) = measured.reshape(-1, 2).T, sky_angles(sky)
     return sc.Observations(
         frame=np.repeat(np.arange(10), STARS),
         x_px=x,
         y_px=y,
-        ra_deg=np.degrees(np.arctan2(sky[:, 1], sky[:, 0])) % 360.0,
-        dec_deg=np.degrees(np.arcsin(sky[:, 2])),
+        ra_deg=ra,
+        dec_deg=dec,
         sigma_px=sigma.ravel(),
         meta={"directions": "apparent"},
     )
