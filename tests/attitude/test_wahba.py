@@ -15,6 +15,7 @@ from starcal_uq.attitude.rotations import (
     rotation_vector,
 )
 from starcal_uq.attitude.wahba import DegenerateFrameError, quest
+from tests.attitude.test_rotations import half_turns
 from tests.helpers.speed import times_as_long
 
 stats = pytest.importorskip("scipy.stats")
@@ -100,17 +101,10 @@ def test_agrees_with_davenport_for_large_residuals() -> None:
     np.testing.assert_allclose(result.loss, quest(b, r, starts, sigma_rad=1.0).loss, rtol=1e-12)
 
 
-def half_turns() -> np.ndarray:
-    axes = np.concatenate(
-        (np.eye(3), [[1, 1, 0], [0, 1, -1]], np.random.default_rng(4).standard_normal((40, 3)))
-    )
-    return exp_rotation(np.pi * axes / np.linalg.norm(axes, axis=1, keepdims=True))
-
-
 @pytest.mark.parametrize("sigma_rad", [0.0, 1e-5])
 def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
     rng = np.random.default_rng(5)
-    rotations = np.concatenate((half_turns(), [np.eye(3)], random_rotations(100, rng)))
+    rotations = np.concatenate((half_turns(), random_rotations(100, rng)))
     rotations = np.concatenate(
         (rotations, exp_rotation(1e-9 * rng.standard_normal(rotations.shape[:2])) @ rotations)
     )

@@ -15,13 +15,8 @@ def test_psis_finds_the_shape_of_a_pareto_tail(k: float) -> None:
     log_weights = k * np.random.default_rng(1).exponential(size=20_000)
     khat = arviz_compat.psis(log_weights)[1]
     assert khat == pytest.approx(k, abs=0.12)
-
-
-def test_psis_has_the_right_sign() -> None:
-    # Bounded weights are harmless; their reciprocals are not. A flipped sign swaps the two.
-    log_weights = -0.9 * np.random.default_rng(2).exponential(size=20_000)
-    assert arviz_compat.psis(log_weights)[1] < 0.3
-    assert arviz_compat.psis(-log_weights)[1] > 0.7
+    # Their reciprocals are bounded, and harmless: a flipped sign swaps the two.
+    assert arviz_compat.psis(-log_weights)[1] < 0.3
 
 
 def test_psis_weights_estimate_a_mean() -> None:

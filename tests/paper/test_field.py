@@ -167,18 +167,6 @@ def test_refuses_a_used_folder(tmp_path) -> None:
         field_experiment(tmp_path)
 
 
-def test_ctrl_c_leaves_no_results(tmp_path) -> None:
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        field_experiment(
-            tmp_path / "out", n_frames=20, n_calibration_frames=20, workers=0, progress=stop
-        )
-    # But what it goes on with.
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [".unfinished"]
-
-
 # A small experiment for the tests, smaller than users are let: its parts are those of a large one.
 SMALL = {"n_frames": 3, "n_calibration_frames": 8, "n_replicates": 3}
 

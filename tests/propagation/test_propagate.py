@@ -15,10 +15,7 @@ import pytest
 from scipy.stats import norm
 
 import starcal_uq as sc
-from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
-from starcal_uq.attitude.wahba import quest
 from starcal_uq.calibration.calibrate import calibrate
-from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import Observations
@@ -348,15 +345,3 @@ def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
     assert np.all((nea[:2] > 0.43) & (nea[:2] < 0.5)) and 6.0 < nea[2] < 7.2
     assert np.all((common[:2] > 4.3) & (common[:2] < 5.6))
     assert rest.max() < 0.1
-
-
-def test_quaternions_of_the_calibration_are_those_of_quest() -> None:
-    """The attitudes that the likelihood profiles and those of QUEST differ by a small part of the
-    noise.
-    """
-    obs, cal = scene()
-    found = quest(
-        unproject_theta("brown", cal.theta, obs.xy), obs.directions_icrs, obs.frame_starts
-    )
-    difference = ARCSEC * left_error(rotation_to_quaternion(found.rotations), cal.quaternions)
-    assert (np.sqrt(np.mean(difference**2, axis=0)) < 0.2 * error().nea_arcsec).all()
