@@ -1,7 +1,5 @@
 """Heads against simulations that are made here, with NumPy and SciPy's rotations alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mountings and their drift, against heads that are simulated here with NumPy and SciPy alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Attitude profiles from files, their interpolation, and the frames of a mission along them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations against SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

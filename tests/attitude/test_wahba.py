@@ -1,7 +1,5 @@
 """QUEST against SciPy, against Davenport's eigenvalue solution, and against its own statistics."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of several cameras in one table are told by their own focal lengths."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

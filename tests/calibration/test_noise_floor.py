@@ -1,7 +1,5 @@
 """Noise beyond what the stars state: found where it is, and not where it is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

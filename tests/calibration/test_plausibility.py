@@ -1,7 +1,5 @@
 """A slip in the table or the camera file is named where a calibration fails."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

@@ -1,7 +1,5 @@
 """Screening: wrong identifications are found."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from functools import lru_cache

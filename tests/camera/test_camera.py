@@ -1,7 +1,5 @@
 """The camera: parameters and units, its file, OpenCV's parameters."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where a distortion folds over."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

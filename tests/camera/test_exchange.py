@@ -1,7 +1,5 @@
 """Cameras for other programs, read by those programs' own libraries."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The lens nearest to another one, whose formula is written out here in NumPy alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Cameras of OpenCV, to and fro."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

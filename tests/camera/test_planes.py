@@ -1,7 +1,5 @@
 """Equidistant models against OpenCV's fisheye, against their formula beyond 90 degrees."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The camera model against OpenCV, against CasADi's own evaluation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

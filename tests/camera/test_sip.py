@@ -1,7 +1,5 @@
 """World coordinates of a frame by astropy, against the rotation and the camera alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

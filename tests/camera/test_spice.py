@@ -1,7 +1,5 @@
 """Instrument kernels of SPICE: published values against their own formulas, in NumPy alone."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Comparison of cameras: p-values that are uniform when nothing differs, and that see what does."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

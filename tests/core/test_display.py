@@ -1,7 +1,5 @@
 """Tab completion lists public names, and figures are drawn into those of the user."""
 
-from __future__ import annotations
-
 import inspect
 
 import pytest

@@ -1,7 +1,5 @@
 """What only some users need: where it is missing, one sentence says how to install it."""
 
-from __future__ import annotations
-
 import gc
 import re
 import sys

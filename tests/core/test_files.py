@@ -1,7 +1,5 @@
 """Cells of tables that may be opened as spreadsheets, and files that are written together."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import os

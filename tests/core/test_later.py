@@ -1,7 +1,5 @@
 """What a calibration leaves until somebody asks for it."""
 
-from __future__ import annotations
-
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy, deepcopy

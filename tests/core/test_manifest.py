@@ -1,7 +1,5 @@
 """Results of a command replace those of before all at once."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import threading

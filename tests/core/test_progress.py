@@ -1,7 +1,5 @@
 """A bar is one line, in a notebook and in a terminal, and nothing elsewhere."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 from typing import Any

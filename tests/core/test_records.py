@@ -1,7 +1,5 @@
 """The codec of results: what goes in comes out to the last bit."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run file and the command line are two forms of the same options."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

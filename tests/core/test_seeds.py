@@ -1,7 +1,5 @@
 """Whatever is random takes a whole number or a Generator, and states the number that repeats it."""
 
-from __future__ import annotations
-
 import inspect
 
 import numpy as np

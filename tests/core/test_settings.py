@@ -1,7 +1,5 @@
 """Limits of settings: every public function refuses what lies outside."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Results that are kept while a command is under way."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Tables of any subject, as they stand in files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

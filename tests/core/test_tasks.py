@@ -1,7 +1,5 @@
 """Tasks over processes: the same results for any number of them, Ctrl-C."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Ctrl-C while sampling: one sentence, what was done is kept."""
 
-from __future__ import annotations
-
 import signal
 import threading
 

@@ -1,7 +1,5 @@
 """Sections of TOML files: what is taken, and what is said of the rest."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Quantities and times of astropy stand for numbers and text."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Sixty frames of the paper's camera, and their calibration."""
 
-from __future__ import annotations
-
 import pytest
 
 import starcal_uq as sc

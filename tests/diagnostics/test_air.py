@@ -1,7 +1,5 @@
 """Refraction that is missing from the directions is found in the residuals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timedelta
 

@@ -1,7 +1,5 @@
 """Tests of the model beside effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

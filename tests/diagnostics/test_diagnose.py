@@ -1,7 +1,5 @@
 """Jackknife, comparison of models, replicated data and other starts."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """The attitude error with the misfit found."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Leaving frames out, and the scatter between frames."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Draws are judged once: what a posterior says of itself is what verdict."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

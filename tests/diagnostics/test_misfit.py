@@ -1,7 +1,5 @@
 """Tests for structure in the residuals."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Comparison of distortion models."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Replicated data against the data."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors that stars bring along, held against a star sensor of a second make."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A wrong time is named by what it does to the directions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import lru_cache

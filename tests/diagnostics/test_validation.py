@@ -1,7 +1,5 @@
 """Validation finds right uncertainties right and wrong ones wrong."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import signal

@@ -1,7 +1,5 @@
 """Every check of the verdict, turned to its other outcome."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

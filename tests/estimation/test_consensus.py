@@ -1,7 +1,5 @@
 """Stars that agree on attitudes before any calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

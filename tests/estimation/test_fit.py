@@ -1,7 +1,5 @@
 """Calibration: every solver on every scene, statuses, results that save themselves."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras in flight and from the literature."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

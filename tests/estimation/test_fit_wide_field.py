@@ -1,7 +1,5 @@
 """Fisheyes of 100 and 180 degrees, whose stars NumPy alone projects, from calibration to report."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Merged runs are what a calibration on all stars gives."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Noise that varies: the fitted model, the weights that follow from it everywhere."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """What a star adds to the sum of squares, and its distribution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

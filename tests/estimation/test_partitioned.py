@@ -1,7 +1,5 @@
 """Calibration of partitioned observations."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil

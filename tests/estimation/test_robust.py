@@ -1,7 +1,5 @@
 """Estimates with tails."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

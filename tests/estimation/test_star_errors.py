@@ -1,7 +1,5 @@
 """Errors of the stars in the covariance."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

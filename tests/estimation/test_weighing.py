@@ -1,7 +1,5 @@
 """Effects that weigh stars, and others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

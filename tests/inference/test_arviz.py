@@ -1,7 +1,5 @@
 """Both generations of ArviZ give the same answers through the compatibility module."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr

@@ -1,7 +1,5 @@
 """Each check of a posterior at both sides of its bound, with what it says and advises."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

@@ -1,7 +1,5 @@
 """The moves leave the target as it is, and the order of draws lets R-hat see what it should."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The exact likelihood at many points, and of a sample of frames."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from starcal_uq.calibration.calibrate import calibrate

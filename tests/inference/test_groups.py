@@ -1,7 +1,5 @@
 """ArviZ's groups against integration over the attitude, a second exposure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

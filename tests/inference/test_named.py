@@ -1,7 +1,5 @@
 """Likelihoods by their names."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

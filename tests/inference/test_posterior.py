@@ -1,7 +1,5 @@
 """A posterior keeps every bit in its file, and shows itself with units."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

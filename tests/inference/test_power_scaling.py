@@ -1,7 +1,5 @@
 """Sensitivity of the posterior to the priors, by power scaling."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The prior predictive check flags a prior that the data contradict."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """Priors are the distributions they say they are, in the units they say."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The sampler draws from the posterior it was given, again and again the same."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 from pathlib import Path

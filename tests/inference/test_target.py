@@ -1,7 +1,5 @@
 """The density that is sampled: its mode, and an independent estimate of its moments."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

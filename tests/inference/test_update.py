@@ -1,7 +1,5 @@
 """A posterior as the next prior."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

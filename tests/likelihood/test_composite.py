@@ -1,7 +1,5 @@
 """Pairs as a composite likelihood: right curvature, right coverage, and what happens without it."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The compressed form of the marginal likelihood."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

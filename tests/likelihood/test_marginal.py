@@ -1,7 +1,5 @@
 """The marginal likelihood, its information, and its compressed form."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pair objective in O(stars) against the explicit sum over pairs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Solvers against NIST's Statistical Reference Datasets for nonlinear regression."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

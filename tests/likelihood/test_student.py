@@ -1,7 +1,5 @@
 """Heavy tails: the likelihood itself."""
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sums over parts of the frames, on the NumPy path and compiled."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Terms with a prior, eliminated: products against the covariance as written, as a dense matrix."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quantiles of the radius of two Gaussian axes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Intervals of shares, and p-values of many tests together."""
 
-from __future__ import annotations
-
 import pytest
 
 from starcal_uq.maths.intervals import binomial_interval, holm, wilson_interval

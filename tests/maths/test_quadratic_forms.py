@@ -1,7 +1,5 @@
 """Tail of weighted sums of squared normal variables, against closed forms and draws."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2, f

@@ -1,7 +1,5 @@
 """Ranks of truths among draws: uniform or not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

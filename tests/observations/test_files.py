@@ -1,7 +1,5 @@
 """Files of observations, and the report of every bad row."""
 
-from __future__ import annotations
-
 import csv
 from functools import partial
 from pathlib import Path

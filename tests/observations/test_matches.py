@@ -1,7 +1,5 @@
 """Matched stars out and in: FITS tables, astrometry.net's files, matches of tetra3 and tetra3rs."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables of other libraries: the same rows from each, and the same messages."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import astropy.units as u

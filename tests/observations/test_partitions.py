@@ -1,7 +1,5 @@
 """A folder of partitions: what is read of it, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

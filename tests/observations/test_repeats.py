@@ -1,7 +1,5 @@
 """A measurement counts once."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 from pathlib import Path

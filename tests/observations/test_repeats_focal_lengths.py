@@ -1,7 +1,5 @@
 """Two exposures of one field are no repeated measurement."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """The observations table in memory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 streams.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from functools import lru_cache

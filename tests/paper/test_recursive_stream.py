@@ -2,8 +2,6 @@
 than a batch.
 """
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

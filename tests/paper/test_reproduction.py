@@ -1,7 +1,5 @@
 """The paper's experiment beside ours: measures of error, readings, judgement, and the report."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

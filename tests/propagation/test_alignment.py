@@ -2,8 +2,6 @@
 flies on others.
 """
 
-from __future__ import annotations
-
 from copy import copy
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """The coupling report on the paper's sensor, and its formulas on matrices with known answers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Distortion against radius: displacement by its formula, and bands that hold what they say."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

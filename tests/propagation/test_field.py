@@ -1,7 +1,5 @@
 """Direction uncertainty over the detector, against draws and rotations fitted one by one."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 from pathlib import Path

@@ -2,8 +2,6 @@
 campaigns.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 from pathlib import Path

@@ -2,8 +2,6 @@
 responses by differences.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sensitivities of attitudes against a solver of Wahba's problem that is written here, in NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
