@@ -16,8 +16,8 @@ COVERED = ("x0", "y0", "f", "k1", "k2", "sigma", "pitch", "yaw", "roll")
 
 @pytest.fixture(scope="module")
 def fixed():
-    """200 replicates of the paper's camera: NEES/p is known to 0.045, a coverage to 0.016."""
-    return validate(sc.paper.paper_camera(), n_replicates=200, seed=1)
+    """120 replicates of the paper's camera: NEES/p is known to 0.058, a coverage to 0.02."""
+    return validate(sc.paper.paper_camera(), n_replicates=120, seed=1, workers=0)
 
 
 def calibration_ratio(found):
@@ -38,19 +38,19 @@ def test_coverage_and_squared_errors(fixed):
     show("fixed truth", fixed)
     assert fixed.ok, fixed.text
     coverage = dict(zip(fixed.quantities, fixed.coverage, strict=True))
-    assert all(0.91 <= coverage[q] <= 0.99 for q in COVERED), coverage
-    assert 0.9 <= fixed.nees_ratio <= 1.1
-    assert 0.9 <= calibration_ratio(fixed) <= 1.1
+    assert all(0.90 <= coverage[q] <= 0.995 for q in COVERED), coverage
+    assert 0.87 <= fixed.nees_ratio <= 1.13
+    assert 0.87 <= calibration_ratio(fixed) <= 1.13
     assert np.abs(fixed.compression_error).max() < 0.1
 
 
 def test_ranks_of_a_fixed_truth(fixed):
-    assert fixed.n_replicates == 200
+    assert fixed.n_replicates == 120
     assert (fixed.rank_p_value > 1e-3).all(), fixed.rank_p_value
 
 
 def test_ranks_of_truths_from_the_prior():
-    found = validate(sc.paper.paper_camera(), n_replicates=120, truth="prior", seed=2)
+    found = validate(sc.paper.paper_camera(), n_replicates=100, truth="prior", seed=2, workers=0)
     show("truth from the prior", found)
     assert found.ok, found.text
     assert (found.rank_p_value > 1e-3).all(), found.rank_p_value
