@@ -21,7 +21,7 @@ from starcal_uq.cli import schemas
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.commands import app
 from starcal_uq.core.formatting import significant
-from tests.cli.conftest import check_document
+from tests.helpers.commands import check_document
 from tests.helpers.outside import campaign
 
 # Calls that end soon, in the order in which they need each other. Others are validated where they

@@ -4,8 +4,6 @@ refused.
 
 from __future__ import annotations
 
-import json
-import sys
 from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
@@ -16,8 +14,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.cli.app import main
 from starcal_uq.diagnostics.diagnose import Diagnosis
+from tests.helpers.commands import Commands
 from tests.helpers.scenes import observations
 
 READERS: tuple[tuple[type, str], ...] = (
@@ -64,13 +62,9 @@ def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
     tmp_path: Path,
 ) -> None:
     out = tmp_path / "demo"
-    argv = ["starcal-uq", "demo", "--frames", "60", "--out", str(out), "--json"]
-    monkeypatch.setattr(sys, "argv", argv)
-    with pytest.raises(SystemExit) as stop:
-        main()
+    commands = Commands(monkeypatch, capsys)
     # It ends with the table of truth and the report.
-    assert not stop.value.code
-    found = json.loads(capsys.readouterr().out)
+    found = commands.document("demo", "--frames", "60", "--out", str(out))
     assert found["calibration"]["parameters"][2]["truth"] == sc.paper.paper_camera().focal_px
     assert found["verdict"]["level"] != "fail" and Path(found["report"]).samefile(
         out / "report.html"
