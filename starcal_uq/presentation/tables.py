@@ -62,16 +62,12 @@ class TextTable:
         cls,
         frame: pd.DataFrame,
         title: str = "",
-        columns: Sequence[str] | None = None,
         formats: Mapping[str, Callable[[Any], str]] | None = None,
         missing: str = "–",
     ) -> TextTable:
-        """Chosen columns of a data frame; numbers with three digits unless `formats` says
-        otherwise.
-        """
+        """The columns of a data frame; numbers with three digits unless `formats` says otherwise."""
         import numpy as np
 
-        frame = frame if columns is None else frame[list(columns)]
         formats = formats or {}
 
         def cell(name: str, value: Any) -> str:

@@ -48,9 +48,9 @@ from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
+from starcal_uq.presentation.pages.budgeting import write_budget
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import explanations
+from starcal_uq.presentation.words.budgeting import explanations, tables
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard_error import EffectError, OnboardError
 from tests.helpers.scenes import observations
@@ -500,10 +500,7 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
     if verdict == "open":
         assert "20000 samples do not resolve a confidence of 99.99999" in outcome.text
         assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.text
-        assert (
-            "1 requirement open: the samples do not resolve"
-            in budget_context(found)["budget"]["headline"]
-        )
+        assert "1 requirement open: the samples do not resolve" in tables(found)["headline"]
     found.save(tmp_path / "budget.csv")
     assert [entry.verdict for entry in Budget.load(tmp_path / "budget.csv").outcomes] == [verdict]
     for ending in ("html", "tex"):

@@ -69,7 +69,7 @@ def write_tex(budget: Budget, path: PathLike) -> None:
 def section_html(budget: Budget) -> str:
     """The section of the report by itself, without a page around it."""
     template = template_environment().get_template("budget_section.html.j2")
-    return template.render(**budget_context(budget), images=_images(budget))
+    return template.render(budget=tables(budget), images=_images(budget))
 
 
 def write_html(budget: Budget, path: PathLike) -> None:
@@ -77,7 +77,7 @@ def write_html(budget: Budget, path: PathLike) -> None:
     text = page(
         "budget.html.j2",
         budget.provenance,
-        **budget_context(budget),
+        budget=tables(budget),
         images=_images(budget),
         data_sha256=budget.provenance.data_sha256 or "",
     )
@@ -326,11 +326,6 @@ def write_budget(budget: Budget, path: PathLike) -> Path:
         raise BudgetError(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
     _WRITERS[ending](budget, path)
     return Path(path)
-
-
-def budget_context(budget: Budget) -> AnyDict:
-    """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``."""
-    return {"budget": tables(budget)}
 
 
 def _images(budget: Budget) -> dict[str, bytes]:

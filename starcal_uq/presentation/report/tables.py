@@ -14,10 +14,7 @@ from starcal_uq.camera.distortion import Parameter, parameters, scales_of, sigma
 from starcal_uq.core.formatting import (
     count,
     decimals_for,
-    fixed,
-    percent,
     plural,
-    plus_minus,
     significant,
     with_sigma,
 )
@@ -35,7 +32,6 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.presentation.report.results import Results
-    from starcal_uq.propagation.coupling import Coupling
 
 Row = AnyDict
 
@@ -75,19 +71,6 @@ def parameter_rows(results: Results) -> list[Row]:
     return [{**row, "symbol": symbol(row["name"])} for row in rows]
 
 
-def weak_directions(coupling: Coupling) -> list[Row]:
-    """The directions that the data determine worst, in words and as weights."""
-    rows = []
-    for direction in coupling.weak_directions:
-        if direction.variance <= 1.4:
-            continue
-        weights = zip(coupling.parameter_names, direction.weights, strict=True)
-        parts = [(symbol(name), fixed(w, 2)) for name, w in weights if abs(w) >= 0.1]
-        share = direction.variance / len(coupling.parameter_names)
-        rows.append({"words": direction.words, "weights": parts, "share": percent(share)})
-    return rows
-
-
 def diagnostics_table(post: Posterior) -> TextTable:
     """Convergence of every sampled parameter."""
     d, sampled = post.diagnostics, list(post.sampled)
@@ -106,11 +89,8 @@ def diagnostics_table(post: Posterior) -> TextTable:
     )
 
 
-def methods_table(results: Results) -> TextTable | None:
+def methods_table(cal: Calibration, post: Posterior) -> TextTable:
     """Estimate, Laplace approximation, importance sampling and emcee side by side."""
-    cal, post = results.calibration, results.posterior
-    if post is None:
-        return None
     d, sampled = post.diagnostics, list(post.sampled)
     specs = [post.parameters[i] for i in sampled]
     scale = scales_of(specs)
@@ -163,15 +143,10 @@ def noise_table(cal: Calibration) -> TextTable | None:
     """The fitted noise model, term by term; None where there is none."""
     if (model := cal.fitted_noise) is None:
         return None
-    rows = [
-        (term.replace("^2", "²"), plus_minus(value, error))
-        for term, value, error in zip(model.terms, model.coefficients, model.errors, strict=True)
-    ]
+    terms, values, errors = [*model.terms], [*model.coefficients], [*model.errors]
     if model.frame_dof is not None:
-        rows.append(
-            ("frames", f"inverse chi-square, {significant(model.frame_dof)} degrees of freedom")
-        )
-    return TextTable(("Term", "Coefficient of the log variance"), tuple(rows))
+        terms, values, errors = [*terms, "frames"], [*values, model.frame_dof], [*errors, np.nan]
+    return table("noise", term=terms, value=values, error=errors)
 
 
 # More images than this are counted, and only those left out are listed.
