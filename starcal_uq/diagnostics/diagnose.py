@@ -227,16 +227,6 @@ def diagnose_apart(
     )
 
 
-def predicted(
-    obs: Observations, cal: Calibration, post: Posterior | None, seed: int
-) -> PredictiveCheck:
-    """The posterior predictive check of `diagnose`: what else can be found beside, once there is a
-    posterior.
-    """
-    obs = weighed(obs, cal)
-    return predictive_check(obs, without_ties(obs, cal), post, seed=seed)
-
-
 def extended(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[Extended | None, bool]:
     """The calibration with the effects that the data would take up, where tests find structure
     beside none, and whether that is known.
@@ -273,7 +263,6 @@ def diagnose(
     seed: Seed = 0,
     progress: Progress | None = None,
     apart: Callable[[], Apart | None] | None = None,
-    predictive: Callable[[], PredictiveCheck | None] | None = None,
 ) -> Diagnosis:
     """Test the model of a calibration in every available way.
 
@@ -294,9 +283,9 @@ def diagnose(
         Seed of everything random.
     progress : callable, optional
         Called with the number of steps done and their total.
-    apart, predictive : callable, optional
-        What waits for `diagnose_apart` and `predicted` of the same arguments, which run elsewhere;
-        what of them is None is found here.
+    apart : callable, optional
+        What waits for `diagnose_apart` of the same arguments, which runs elsewhere; None of it is
+        asked for here again.
     """
     seed = seed_of(seed)
     step = progress or (lambda done, total: None)
@@ -311,13 +300,13 @@ def diagnose(
     normals = None if cal.known_effects.fitted else FrameNormals.at(obs, cal)
     found = jackknife_of_all(whole) or _jackknife(obs, cal, normals)
     step(1, 4)
+    predictive = predictive_check(obs, whole, post, seed=seed)
+    step(2, 4)
     # A single frame cannot be left out, and a field holds what other models would add to the lens.
     asked = obs.n_frames > 1 and "field" not in cal.known_effects.names
     comparison = None
     if models and asked:
         comparison = compare_models(obs, cal, models, seed=seed, normals=normals)
-    step(2, 4)
-    checked = (predictive and predictive()) or predicted(obs, whole, post, seed)
     step(3, 4)
     rest = None if apart is None or whole.partitions is not None else apart()
     if rest is None:
@@ -325,7 +314,7 @@ def diagnose(
     step(4, 4)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(
-        predictive=checked,
+        predictive=predictive,
         jackknife=found,
         comparison=comparison,
         theta=tuple(theta.tolist()),

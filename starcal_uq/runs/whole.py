@@ -286,7 +286,7 @@ def finish(
     run: Run, ahead: Ahead, options: AnyMapping, *, seed: int, watch: Watch, report: bool = True
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
-    from starcal_uq.diagnostics.diagnose import diagnose_apart, predicted
+    from starcal_uq.diagnostics.diagnose import diagnose_apart
     from starcal_uq.presentation.report.drawing import AFTER
 
     propagation = _of(PropagationOptions, options)
@@ -295,9 +295,9 @@ def finish(
     if profile is not None and (effects is None or "temperature" not in effects.names):
         run._tell(f"The data support no effect of the temperature: {profile} is left out.")
         del propagation["temperature_profile"]
-    apart = predictive = None
-    beside = run.calibration.partitions is None and not run.did("diagnose")
-    if beside:
+    apart = None
+    # The other process draws the frames of images, which takes as long as this.
+    if run.images is None and run.calibration.partitions is None and not run.did("diagnose"):
         apart = ahead.begin(partial(diagnose_apart, seed=seed), run.observations, run.calibration)
     watch.tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
     ahead.draw(run.calibrated, AFTER["calibration"])
@@ -307,10 +307,6 @@ def finish(
         sampling = _of(SamplingOptions, options) | {"dof": options.get("dof")}
         with watch.bar("sampling") as progress:
             sample_run(run, sampling, seed=seed, progress=progress)
-    if beside and run.images is None:
-        # Beside the frames of images there is no time for it.
-        of = run.observations, run.calibration, run.posterior
-        predictive = ahead.begin(predicted, *of, seed)
     ahead.draw(run.results, AFTER["sampling"])
     if not run.did("coupling"):
         run.couple()
@@ -319,7 +315,7 @@ def finish(
     ahead.draw(run.results, AFTER["propagation"])
     if not run.did("diagnose"):
         with watch.bar("diagnosis") as progress:
-            run.diagnose(seed=seed, progress=progress, apart=apart, predictive=predictive)
+            run.diagnose(seed=seed, progress=progress, apart=apart)
     ahead.draw(run.results, AFTER["diagnosis"])
     if not run.did("budget"):
         run.budget(file=options.get("budget"), seed=seed)

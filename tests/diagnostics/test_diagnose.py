@@ -9,13 +9,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.records import to_plain
-from starcal_uq.diagnostics.diagnose import (
-    Diagnosis,
-    diagnose,
-    diagnose_apart,
-    multi_start,
-    predicted,
-)
+from starcal_uq.diagnostics.diagnose import Diagnosis, diagnose, diagnose_apart, multi_start
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
@@ -60,11 +54,6 @@ def test_half_of_a_diagnosis_may_be_found_elsewhere(obs, cal):
     # The control: what came from elsewhere is what stands there.
     other = dataclasses.replace(apart, starts=None)
     assert diagnose(obs, cal, **options, apart=lambda: other).starts is None
-    here = diagnose(obs, cal, **options, apart=lambda: other, predictive=lambda: None).predictive
-    assert here == predicted(obs, cal, None, 3)
-    there = dataclasses.replace(here, n_draws=7)
-    found = diagnose(obs, cal, **options, apart=lambda: other, predictive=lambda: there)
-    assert found.predictive == there
 
 
 def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, tmp_path):
