@@ -254,9 +254,7 @@ _VERSION = 1
 
 
 def level_of(stars: StarCatalogue, n: int, folder: PathLike | None) -> Level:
-    """The level of the brightest n stars, made when it is first asked for, and kept in a `folder`
-    where there is one.
-    """
+    """The level of the brightest n stars, made once, and kept in a `folder` where there is one."""
     bright = stars.brightest_first[1][:n]
 
     def make() -> Level:

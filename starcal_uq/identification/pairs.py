@@ -181,17 +181,18 @@ def find_star_pairs(
     same = np.flatnonzero(np.diff(angle) == 0.0)
     same = np.union1d(same, same + 1)
     pairs[same] = pairs[same[np.lexsort((pairs[same, 1], pairs[same, 0], angle[same]))]]
-    # Each pair twice, in the order of angles, which transposing a sparse row keeps: by counts,
-    # without comparing.
-    twice = np.arange(2 * len(pairs), dtype=np.int32)
-    row = csr_array(
-        (twice, pairs.ravel(), np.array([0, len(twice)], dtype=np.int32)), shape=(1, len(star))
-    )
-    by_star = row.tocsc()
-    neighbour = pairs[:, ::-1].ravel()[by_star.data]
+
+    def by_star(values: Any) -> Any:
+        """Values of both stars of each pair, star by star, those of one star in the order of angles,
+        which transposing a sparse row keeps: by counts, without comparing.
+        """
+        ends = np.array([0, 2 * len(pairs)], dtype=np.int32)
+        return csr_array((values, pairs.ravel(), ends), shape=(1, len(star))).tocsc()
+
+    neighbour = by_star(pairs[:, ::-1].ravel())
     first, second = np.ascontiguousarray(pairs.T)
-    start = by_star.indptr.astype(np.int64)
-    return StarPairs(star, chosen, first, second, angle, neighbour, angle[by_star.data // 2], start)
+    start, angles = neighbour.indptr.astype(np.int64), by_star(np.repeat(angle, 2)).data
+    return StarPairs(star, chosen, first, second, angle, neighbour.data, angles, start)
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:

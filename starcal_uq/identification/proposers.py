@@ -44,14 +44,23 @@ def prepare_engine(
     """The catalogue prepared for "pyramid", or for the engine that a package offers under this name:
     a function of stars, geometry and tolerance that gives a `Proposer`.
 
-    IdentificationError where no installed package offers it.
+    The pairs of "pyramid" are those that this process has used before, or else those of a file in
+    the `folder` where there is one, or new ones. IdentificationError where no installed package
+    offers the engine.
     """
     found = offered_engine(engine)
-    if found is None:
-        pairs = prepare_pairs(stars, geometry, tolerance, folder)
-        return partial(hypotheses, pairs.ready())
-    proposer: Proposer = found.load()(stars, geometry, tolerance)
-    return proposer
+    if found is not None:
+        proposer: Proposer = found.load()(stars, geometry, tolerance)
+        return proposer
+    f, w, h = geometry.focal_px, geometry.width_px, geometry.height_px
+    largest = 2.0 * float(np.arctan(0.5 * np.hypot(w, h) / f)) * (1.0 + tolerance.focal) + 0.002
+    # Rounded, so that cameras of nearly the same field share a file.
+    largest = float(np.ceil(largest * 200.0) / 200.0)
+    field_sr = float(f"{w * h / f**2:.2g}")
+    given = stars.directions_icrs, stars.mag, field_sr, largest
+    key = stars.digest(len(stars)), field_sr, largest
+    pairs = remembered(_recent, _RECENT, key, partial(cached_star_pairs, *given, folder))
+    return partial(hypotheses, pairs.ready())
 
 
 def offered_engine(name: str) -> EntryPoint | None:
@@ -67,22 +76,3 @@ def offered_engine(name: str) -> EntryPoint | None:
             f"there is no engine {shown(name)}: choose pyramid, or install a package that offers it."
         )
     return found
-
-
-def prepare_pairs(
-    stars: StarCatalogue,
-    geometry: FieldGeometry,
-    tolerance: CameraTolerance,
-    folder: PathLike | None,
-) -> StarPairs:
-    """Pattern stars and their pairs for a field of view: those that this process has used before, or
-    else those of a file in the `folder` where there is one, or new ones.
-    """
-    f, w, h = geometry.focal_px, geometry.width_px, geometry.height_px
-    largest = 2.0 * float(np.arctan(0.5 * np.hypot(w, h) / f)) * (1.0 + tolerance.focal) + 0.002
-    # Rounded, so that cameras of nearly the same field share a file.
-    largest = float(np.ceil(largest * 200.0) / 200.0)
-    field_sr = float(f"{w * h / f**2:.2g}")
-    given = stars.directions_icrs, stars.mag, field_sr, largest
-    key = stars.digest(len(stars)), field_sr, largest
-    return remembered(_recent, _RECENT, key, partial(cached_star_pairs, *given, folder))

@@ -137,9 +137,7 @@ class FrameTable:
 
 
 class Search:
-    """The catalogue prepared for one camera and its tolerances; `prepare` makes the proposer when
-    it is first needed.
-    """
+    """One camera, its tolerances and catalogue, which `prepare` makes ready when first needed."""
 
     def __init__(
         self,

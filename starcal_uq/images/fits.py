@@ -313,9 +313,7 @@ def explained(stamps: Stamps, fit: StarFit, scale: float) -> FloatArray:
 
 
 def _of_others(stamps: Stamps, state: FloatArray, pairs: IntArray, stars: IntArray) -> FloatArray:
-    """The light (m, m, k) in the stamps of some `stars` (k,) of those that reach into them; `pairs`
-    are sorted.
-    """
+    """Light (m, m, k) of other stars in the stamps of some `stars` (k,), by sorted `pairs`."""
     others = np.zeros((*stamps.counts.shape[:2], len(stars)))
     if len(pairs):
         here, there = pairs.T
@@ -394,12 +392,11 @@ def window_positions(
     good = np.isfinite(x) & np.isfinite(y)
     if not len(x):
         return x, y, good
-    half, moving, counts = len(stamps.counts) // 2, np.flatnonzero(good), stamps.counts
+    half, moving = len(stamps.counts) // 2, np.flatnonzero(good)
+    counts = stamps.counts if good.all() else stamps.counts[..., moving]
     steps, factor = np.arange(2 * half + 1)[:, None], 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
     small, fall = np.zeros(len(x)) + step_px**2, -0.5 / window_px**2
     at, last = np.stack([x - stamps.x0, y - stamps.y0]), np.zeros((2, len(x)))
-    if len(moving) < len(x):
-        counts = counts[..., moving]
     for _ in range(_WINDOW_ITERATIONS):
         here = at[:, moving]
         w = steps - here[:, None]
@@ -460,11 +457,9 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     noise = spread / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
     inverse = np.linalg.inv(gradient)
     covariance = fit.covariance.copy()
-    covariance[:, :2, :2] = inverse @ noise @ inverse.transpose(0, 2, 1)
+    covariance[use, :2, :2] = (inverse @ noise @ inverse.transpose(0, 2, 1))[use]
     x, y = np.where(use, x, fit.x_px), np.where(use, y, fit.y_px)
-    return replace(
-        fit, x_px=x, y_px=y, covariance=np.where(use[:, None, None], covariance, fit.covariance)
-    )
+    return replace(fit, x_px=x, y_px=y, covariance=covariance)
 
 
 def window_moments(

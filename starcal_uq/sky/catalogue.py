@@ -105,9 +105,7 @@ class StarCatalogue(Shown):
 
     @cached_property
     def brightest_first(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Rows of the stars (n,), brightest first, with their directions (n, 3) and magnitudes
-        (n,).
-        """
+        """Rows, directions (n, 3) and magnitudes of the stars, brightest first."""
         rows = np.argsort(self.mag, kind="stable").astype(np.int64)
         return rows, self.directions_icrs[rows], self.mag[rows]
 
