@@ -203,6 +203,14 @@ class Camera(Shown):
         """The distortion model by its name, as `starcal_uq.calibrate` takes it."""
         return cast("ModelName", self.distortion)
 
+    @property
+    def folds(self) -> bool:
+        """True if the distortion folds over within the detector."""
+        from starcal_uq.camera.projection import fold_radius_px
+
+        radius = self.corner_radius_px
+        return fold_radius_px(self.distortion, self.theta, radius) <= radius
+
     def contains(self, xy: ArrayLike) -> BoolArray:
         """True for each point on the detector, edges included.
 

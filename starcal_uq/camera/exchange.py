@@ -22,7 +22,7 @@ from starcal_uq.camera.distortion import Parameter, get_model, shared_names, wit
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
 from starcal_uq.camera.nearest import nearest_theta
 from starcal_uq.camera.planes import PINHOLE
-from starcal_uq.camera.projection import fold_radius_px, project, unproject
+from starcal_uq.camera.projection import project, unproject
 from starcal_uq.camera.sip import EXACT_PX, POINTS, in_front, pixel_grid, sip_header, sip_terms
 from starcal_uq.camera.spice import NO_INSTRUMENT, kernel_text
 from starcal_uq.core.errors import CameraError
@@ -63,10 +63,7 @@ def export_camera(
             f"{to!r} is no format for a camera: use one of {', '.join(CAMERA_FORMATS)}."
         )
     ensure_new(path, force)
-    if (
-        fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px)
-        <= camera.corner_radius_px
-    ):
+    if camera.folds:
         raise CameraError(
             "the distortion folds over within the detector: a camera that does has no counterpart."
         )

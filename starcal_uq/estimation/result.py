@@ -15,7 +15,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters, sigma_parameter
-from starcal_uq.camera.projection import fold_radius_px, unproject
+from starcal_uq.camera.projection import unproject
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, reading
@@ -592,9 +592,4 @@ def check_camera(camera: Camera, status: Status) -> Status:
         return status
     if not camera.contains(camera.theta[:2]):
         return Status.OUTSIDE_DETECTOR
-    if (
-        fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px)
-        <= camera.corner_radius_px
-    ):
-        return Status.FOLDED
-    return status
+    return Status.FOLDED if camera.folds else status

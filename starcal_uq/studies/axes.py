@@ -13,7 +13,6 @@ from starcal_uq.calibration.calibrate import METHODS
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, get_model, model_names
 from starcal_uq.camera.fields import corner_displacement_px
-from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import KEYS, Limit
@@ -170,8 +169,7 @@ def camera_of(base: Camera, settings: AnyMapping) -> Camera:
         camera = camera.replace(coefficients=tuple(known.values()))
     if "distortion_px" in settings and get_model(camera.distortion).lens:
         camera = _with_displacement(camera, settings["distortion_px"])
-    radius = camera.corner_radius_px
-    if fold_radius_px(camera.distortion, camera.theta, radius) <= radius:
+    if camera.folds:
         raise StudyError("the distortion folds over inside the field: make it smaller.")
     return camera
 

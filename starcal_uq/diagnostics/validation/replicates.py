@@ -16,7 +16,6 @@ import numpy as np
 
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import parameters, sigma_parameter
-from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.settings import Truth
@@ -141,14 +140,7 @@ def _truth(study: Replication, rng: np.random.Generator) -> tuple[Camera, float]
         if not theta[2] > 0.0:
             continue
         camera = study.camera.with_theta(theta)
-        inside = (
-            -0.5 < theta[0] < camera.width_px - 0.5 and -0.5 < theta[1] < camera.height_px - 0.5
-        )
-        if (
-            inside
-            and fold_radius_px(camera.distortion, theta, camera.corner_radius_px)
-            > camera.corner_radius_px
-        ):
+        if camera.contains(theta[:2]) and not camera.folds:
             return camera, sigma_px
     raise PriorError(
         f"none of {_MAX_TRUTHS} draws of the prior is a camera whose principal point is on the "
