@@ -25,7 +25,7 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.provenance import Provenance
-from starcal_uq.core.records import to_plain
+from starcal_uq.core.records import to_json, to_plain
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Advice, Check, Code, Level, Order
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, PathLike
@@ -418,7 +418,7 @@ class Budget(Shown):
                 if told := "difference" not in record and record["explanation"]:
                     # A version before wrote words alone.
                     words = Finding(Difference.IN_WORDS, {"words": told})
-                    record["difference"] = json.dumps(to_plain(words))
+                    record["difference"] = to_json(words)
                 by_kind.setdefault(record["record"], []).append(record)
             settings = {
                 record["name"]: json.loads(record["value"]) for record in by_kind["setting"]
@@ -543,7 +543,7 @@ def _text(value: Any) -> str:
         texts = all(isinstance(entry, str) for entry in value)
         return _SEPARATOR.join(value) if texts else json.dumps(value)
     if isinstance(value, Finding):
-        return json.dumps(to_plain(value))
+        return to_json(value)
     if value is None:
         return ""
     return repr(float(value)) if isinstance(value, float) else str(value)

@@ -190,12 +190,8 @@ def part_of(record: type) -> Part:
         said[name] = _first_paragraph(getter).removesuffix(".")
         hints[name] = get_type_hints(getter)["return"]
     keys = {name: key(name, _words(hints[name]), said[name]) for name in names}
-    part = RECORDS[record.__name__] = Part(record.__name__, _first_line(record), keys)
+    part = RECORDS[record.__name__] = Part(record.__name__, _first_paragraph(record), keys)
     return part
-
-
-def _first_line(documented: Any) -> str:
-    return (getdoc(documented) or "").partition("\n")[0]
 
 
 def _first_paragraph(documented: Any) -> str:

@@ -275,14 +275,19 @@ def _check_sizes(record: Any, name: str) -> None:
             raise ValueError(f"{_below(name, field)} holds a value that is not finite")
 
 
+def to_json(record: Any, **options: Any) -> str:
+    """A record, or plain values, as JSON; `options` are those of ``json.dumps``."""
+    return json.dumps(to_plain(record), **options)
+
+
 def hash_of(value: Any) -> str:
     """SHA-256 of a record, or of plain values, that does not depend on the order of keys."""
-    return hashlib.sha256(json.dumps(to_plain(value), sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(to_json(value, sort_keys=True).encode()).hexdigest()
 
 
 def write_json(record: Any, path: PathLike) -> None:
     """Write a record, or plain values, as JSON for readers too; atomically, overwritten."""
-    atomic_write_text(path, json.dumps(to_plain(record), indent=1) + "\n")
+    atomic_write_text(path, to_json(record, indent=1) + "\n")
 
 
 def read_json(cls: type[Record], path: PathLike, what: str, remedy: str | Remedy) -> Record:

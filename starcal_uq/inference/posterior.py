@@ -20,7 +20,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
 from starcal_uq.core.provenance import Provenance, Traced
-from starcal_uq.core.records import Arrays, from_plain, to_plain
+from starcal_uq.core.records import Arrays, from_plain, to_json, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.status import CODES, Check, Level, Words, worst
@@ -382,7 +382,7 @@ class Posterior(Shown, Traced):
             "draw_order": DRAW_ORDER,
             "n_walkers": self.n_walkers,
             "n_steps": self.n_steps,
-            "provenance": json.dumps(to_plain(self.provenance)),
+            "provenance": to_json(self.provenance),
         }
         if not self.sigma_sampled:
             attrs[f"{self.sigma_name}_given"] = float(self.sigma_draws[0])

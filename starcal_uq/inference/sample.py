@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import secrets
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +16,7 @@ from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError, check_known, require
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import Provenance, data_hashes, provenance
-from starcal_uq.core.records import to_plain
+from starcal_uq.core.records import to_json
 from starcal_uq.core.settings import (
     Evaluation,
     LikelihoodName,
@@ -249,7 +248,7 @@ class _Run:
 
     def fingerprint(self, target: Target, name: str) -> str:
         identity = {k: v for k, v in self.provenance.items() if k != "created_utc"}
-        text = json.dumps(to_plain([identity, self.priors, name, target.centre, target.transform]))
+        text = to_json([identity, self.priors, name, target.centre, target.transform])
         return hashlib.sha256(text.encode()).hexdigest()
 
     def sample(

@@ -22,7 +22,7 @@ from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.formatting import count, plural
-from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.core.records import from_plain, to_json
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import OnboardModel
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floats
@@ -384,7 +384,7 @@ class AttitudeError(Shown):
         """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are
         not kept.
         """
-        misfit = "" if self.misfit is None else json.dumps(to_plain(self.misfit))
+        misfit = "" if self.misfit is None else to_json(self.misfit)
         table = self.to_written().assign(
             n_draws=self.n_draws,
             n_frames=self.n_frames,
@@ -410,9 +410,7 @@ class AttitudeError(Shown):
             }
         table = table.assign(alignment=self.alignment, **columns)
         if self.variants:
-            aboard = json.dumps(
-                to_plain(_Aboard(self.onboard, self.variants, self.thermal_response))
-            )
+            aboard = to_json(_Aboard(self.onboard, self.variants, self.thermal_response))
             table = table.assign(onboard=[aboard] + [""] * (len(table) - 1))
             for own in self.variants:
                 figures = np.full((len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)

@@ -5,7 +5,6 @@ tables for a text.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import os
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text, ensure_new, split_part, write_csv
 from starcal_uq.core.formatting import join_words
+from starcal_uq.core.records import write_json
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, PathLike, Progress
@@ -171,12 +171,12 @@ def _write_covariance(best: Calibration | Posterior, path: Path) -> str:
         "distortion": best.camera.distortion,
         "parameter_names": [p.name for p in specs],
         "units": [p.unit for p in specs],
-        "mean": (best.calibrated_camera if isinstance(best, Posterior) else best).theta.tolist(),
-        "covariance": best.covariance.tolist(),
+        "mean": (best.calibrated_camera if isinstance(best, Posterior) else best).theta,
+        "covariance": best.covariance,
         "data_sha256": best.provenance.data_sha256,
         "versions": best.provenance.versions,
     }
-    atomic_write_text(path, json.dumps(content, indent=1) + "\n")
+    write_json(content, path)
     return (
         f"mean and covariance of {', '.join(p.name for p in specs)}, of the {content['source']}, "
         "in px units."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from starcal_uq.budgeting.rows import confidence_text
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.manifest import making
-from starcal_uq.core.records import to_plain
+from starcal_uq.core.records import to_plain, write_json
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.costs import EffectCosts
@@ -73,7 +72,7 @@ def write_plan(
         for name, rows in tables.items():
             if rows is not None:
                 write_csv(rows, path / f"{name}.csv")
-        atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
+        write_json(plan_record(plan), path / "plan.json")
         atomic_write_text(path / PAGE, text)
     return Path(folder) / PAGE
 
