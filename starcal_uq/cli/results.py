@@ -21,17 +21,12 @@ def _calibration(result: Any) -> AnyDict:
     table["truth"] = [true.get(name) for name in table["parameter"]]
     table["z"] = (table["estimate"] - table["truth"].astype(float)) / table["sigma"]
     return {
-        "method": cal.method,
-        "n_stars": cal.n_stars,
-        "n_frames": cal.n_frames,
         "status": cal.status.name,
         "camera": cal.camera.to_dict(),
         "focal_mm": cal.camera.focal_mm,
         "focal_sigma_mm": None if pitch is None else cal.sigmas[2] * pitch * 1e-3,
         "parameters": table,
         "notes": [*filter(None, (told("fitted_noise", cal), told("fallback", cal)))],
-        "effects": cal.effects,
-        "ties": cal.ties,
     }
 
 
@@ -91,7 +86,6 @@ def _diagnosis(result: Any) -> AnyDict:
         **{key: [] if part is None else part.to_dataframe() for key, part in tables.items()},
         "models": [] if result.comparison is None else result.comparison.scores,
         "predictive": result.predictive.statistics,
-        "starts": result.starts,
         "notes": [part.text for part in (result.comparison, result.stars) if part is not None],
     }
 
@@ -125,10 +119,7 @@ def _study(result: Any) -> AnyDict:
     return {
         "name": found.definition.name,
         "question": found.definition.question,
-        "n_cells": found.n_cells,
         "n_ok": int(found.ok.sum()),
-        "complete": found.complete,
-        "problems": found.problems,
         "answer": study_answer(found) if numbers else [],
         "advice": study_advice(found) if numbers else [],
         "limits": study_limits(found),

@@ -54,7 +54,7 @@ class Part:
     keys : mapping of str to dict
         JSON Schema of what stands under each key.
     take : callable, optional
-        What stands under keys that are no attributes of a result.
+        What stands under keys that are no attributes of a result, or of the first of several.
     """
 
     name: str
@@ -69,6 +69,8 @@ class Part:
         own = result if isinstance(result, Mapping) else {}
         if self.take is not None and not own:
             own = self.take(result)
+        if type(result) is tuple:
+            result, *_ = result
         return {
             key: _fitted(
                 kind,
