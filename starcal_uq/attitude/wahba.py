@@ -156,11 +156,9 @@ def quest(
     DegenerateFrameError
         One star, coinciding stars or values that are not finite, if `on_degenerate` is "raise".
     """
-    b, r, starts = (
-        np.asarray(b, dtype=float),
-        np.asarray(r, dtype=float),
-        np.asarray(starts, dtype=np.int64),
-    )
+    b = np.asarray(b, dtype=float)
+    r = np.asarray(r, dtype=float)
+    starts = np.asarray(starts, dtype=np.int64)
     _check_shapes(b, r, starts)
     w = _weights(weights, sigma_rad, b.shape[-2])
     batch = b if b.ndim == 3 else b[None]

@@ -65,10 +65,8 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     rows = []
     for entry in expected:
         place = CONTRIBUTORS.index(entry.name)
-        held, with_misfit = (
-            attitude.if_model_holds_arcsec[place],
-            attitude.with_misfit_found_arcsec[place],
-        )
+        held = attitude.if_model_holds_arcsec[place]
+        with_misfit = attitude.with_misfit_found_arcsec[place]
         counted = attitude.headline_arcsec[place]
         scale = np.divide(held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
         scale = np.minimum(scale, 1.0)

@@ -28,13 +28,11 @@ if TYPE_CHECKING:
     from starcal_uq.observations.repeats import Fingerprints
     from starcal_uq.observations.table import Observations
 
-INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = (
-    "independent",
-    "same",
-    "A within B",
-    "B within A",
-    "overlapping",
-)
+INDEPENDENT = "independent"
+SAME = "same"
+A_IN_B = "A within B"
+B_IN_A = "B within A"
+OVERLAP = "overlapping"
 # What the covariance of a difference rests on, or why there is none.
 Basis = Enum(
     "Basis",

@@ -146,10 +146,8 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     gram, weights = sums.gram[: sums.p + 1, : sums.p + 1], noise_weights(obs, cal.camera)
-    noise, of_noise = (
-        NoiseSums(Freed.pieces(obs, cal, gram), weights, bool(cal.known_effects.fitted)),
-        [],
-    )
+    noise = NoiseSums(Freed.pieces(obs, cal, gram), weights, bool(cal.known_effects.fitted))
+    of_noise = []
     if noise.dof >= LEAST_DOF:
         of_noise = [(f"noise that changes with {name}", name, z, p) for name, z, p in noise.tests()]
     if (frames := noise.by_frame()) is not None:

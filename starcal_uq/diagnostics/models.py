@@ -298,11 +298,9 @@ def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) ->
     sigma = np.sqrt(np.sum(normals.squares) / rng.chisquare(dof, n_draws))
     centre = np.linalg.solve(normals.matrix, normals.slopes.sum(axis=0))
     z = centre + sigma[:, None] * (rng.standard_normal((n_draws, len(factor))) @ factor.T)
-    slopes, matrices, own_dof = (
-        normals.slopes[chosen],
-        normals.matrices[chosen],
-        normals.dof[chosen],
-    )
+    slopes = normals.slopes[chosen]
+    matrices = normals.matrices[chosen]
+    own_dof = normals.dof[chosen]
     squares = (
         normals.squares[chosen]
         - 2.0 * z @ slopes.T
@@ -332,12 +330,10 @@ def closed_form(normals: FrameNormals, *, left_out: bool = True) -> FloatArray:
     """
     from scipy.special import gammaln
 
-    matrix, matrices, slopes, dof = (
-        normals.matrix,
-        normals.matrices,
-        normals.slopes,
-        normals.dof,
-    )
+    matrix = normals.matrix
+    matrices = normals.matrices
+    slopes = normals.slopes
+    dof = normals.dof
     squares, total = normals.squares.sum(), slopes.sum(axis=0)
     if left_out:
         z, rest = normals.left_out()

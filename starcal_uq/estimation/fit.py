@@ -319,12 +319,10 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
     if settings.dof is None and found.nu < DEFAULT_DOF:
         nu, near = DEFAULT_DOF, found.stage.theta
         found = refine(frames, model, near, found.state.rotations, nu, search.max_iterations)
-    theta, sigma, state, information = (
-        found.stage.theta,
-        found.sigma,
-        found.state,
-        found.information,
-    )
+    theta = found.stage.theta
+    sigma = found.sigma
+    state = found.state
+    information = found.information
     status = found.stage.status
     if (
         not np.isfinite(state.value)
@@ -334,10 +332,8 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
         reason = status if not status.ok else Status.SINGULAR
         raise failed(MarginalLikelihood(start.frames, model), theta, camera, reason)
     status = check_camera(camera.with_theta(theta), status)
-    gaussian, matrix = (
-        MarginalLikelihood(start.frames, model),
-        scaled_inverse(found.covariance) * sigma**2,
-    )
+    gaussian = MarginalLikelihood(start.frames, model)
+    matrix = scaled_inverse(found.covariance) * sigma**2
     names, factors = undetermined(gaussian, theta, matrix, sigma, camera, status)
     made: AnyDict = {"method": "efficient", "solver": search.solver, "distortion": model}
     student: AnyDict = {

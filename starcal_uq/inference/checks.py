@@ -403,10 +403,8 @@ def _evaluation(post: Posterior) -> Check | None:
     """Was the compressed likelihood good enough, where it was used or tried?"""
     d = post.diagnostics
     compression = CompressionCheck(d.compressed_max_difference, d.compressed_khat)
-    compressed, compared = (
-        d.likelihood_used == "compressed",
-        not np.isnan(compression.max_difference),
-    )
+    compressed = d.likelihood_used == "compressed"
+    compared = not np.isnan(compression.max_difference)
     if not compressed and not compared:
         return None
     level = Level.PASS

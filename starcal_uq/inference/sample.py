@@ -197,10 +197,8 @@ def sample(
     if isinstance(likelihood, str):
         outcome, compression = _with_fallback(run, evaluation, checkpoint)
     else:
-        outcome, compression = (
-            run.sample(label, likelihood.log_likelihood, checkpoint),
-            CompressionCheck(),
-        )
+        outcome = run.sample(label, likelihood.log_likelihood, checkpoint)
+        compression = CompressionCheck()
     return _assemble(run, outcome, compression)
 
 

@@ -133,10 +133,8 @@ class Judged:
         ]
         covered, edge = 0.0, low
         for t in sorted(rivals, key=lambda t: t.middle - MAX_Z * t.scale):
-            first, last = (
-                max(t.middle - MAX_Z * t.scale, edge),
-                min(t.middle + MAX_Z * t.scale, high),
-            )
+            first = max(t.middle - MAX_Z * t.scale, edge)
+            last = min(t.middle + MAX_Z * t.scale, high)
             covered += max(last - first, 0.0)
             edge = max(edge, last)
         return covered / (high - low)

@@ -40,10 +40,8 @@ if TYPE_CHECKING:
 IDENTIFIED, LEFT_OUT, NOT_MATCHED = "identified", "left out", "not matched"
 NO_STAR, FAINTER = "at no star of the catalogue", "fainter than the stars searched for"
 # What leaves a star out, if it is not screening.
-_LEFT_OUT, _WHOLE = (
-    "displaced by a neighbour, or low above the horizon",
-    "in a frame that keeps too few",
-)
+_LEFT_OUT = "displaced by a neighbour, or low above the horizon"
+_WHOLE = "in a frame that keeps too few"
 # A detection so near to a star's place is that star's, px, widths of a star image, and scatter of
 # the frame's stars.
 _NEAR_PX, _NEAR_PSF, _NEAR_RMS = 3.0, 2.5, 5.0

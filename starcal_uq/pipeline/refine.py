@@ -118,10 +118,8 @@ def identify_and_calibrate(
         except RepeatedFramesError:
             raise
         except CalibrationError as error:
-            stars_words, frames_words = (
-                plural(obs.n_stars, "star"),
-                plural(found.n_identified, "frame"),
-            )
+            stars_words = plural(obs.n_stars, "star")
+            frames_words = plural(found.n_identified, "frame")
             raise CalibrationError(
                 f"{stars_words} in {frames_words} were identified, but they do not determine the "
                 f"camera ({error}) Give "

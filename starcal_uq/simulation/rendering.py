@@ -162,10 +162,8 @@ class Scene:
             # Sums of Poisson numbers are Poisson numbers: only the uniform part is drawn for every
             # pixel.
             electrons = uniform_shot_noise(uniform, shape, rng)
-            light, level = (
-                rng.poisson(light).astype(np.float64),
-                rng.poisson(level).astype(np.float64),
-            )
+            light = rng.poisson(light).astype(np.float64)
+            level = rng.poisson(level).astype(np.float64)
         flat = electrons.reshape(-1)
         flat[pixel] += light
         flat[hot] += level

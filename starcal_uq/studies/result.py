@@ -33,13 +33,11 @@ NETCDF, PARQUET = "study.nc", "study.parquet"
 # An error that falls more slowly than this power of the frames, a thousand times more of them, is
 # at its floor.
 _NO_GAIN = -0.05
-_PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = (
-    "parameter",
-    "parameter_2",
-    "axis",
-    "frames_factor",
-    "simpler",
-)
+_PARAMETER = "parameter"
+_OTHER = "parameter_2"
+_AXIS = "axis"
+_FACTOR = "frames_factor"
+_SIMPLER = "simpler"
 
 # In place of a unit: each parameter has its own.
 OWN_UNIT = "unit of the parameter"

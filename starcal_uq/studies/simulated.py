@@ -214,10 +214,8 @@ def observe(
     """A table of the frames with noise; stars whose catalogue errs have other directions in it than
     in the sky.
     """
-    stars, frame = (
-        geometry.depth.stars,
-        np.repeat(np.arange(geometry.n_frames), np.diff(geometry.starts)),
-    )
+    stars = geometry.depth.stars
+    frame = np.repeat(np.arange(geometry.n_frames), np.diff(geometry.starts))
     xy = geometry.pixel + noise[:, None] * rng.standard_normal(geometry.pixel.shape)
     ra, dec = stars.ra_deg[geometry.star], stars.dec_deg[geometry.star]
     error = settings["direction_mas"]

@@ -285,11 +285,9 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
         frame = cal.partitions.largest_frame
     else:
         z = np.abs(normalised_residuals(cal, obs))
-        n_stars, found, largest = (
-            obs.n_stars,
-            int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1))),
-            float(z.max()),
-        )
+        n_stars = obs.n_stars
+        found = int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1)))
+        largest = float(z.max())
         frame = int(obs.frame[int(np.argmax(z.max(axis=1)))])
     expected = n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
     # Probability of at least `found` where `expected` are expected (Poisson).

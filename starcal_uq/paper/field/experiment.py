@@ -152,10 +152,8 @@ def _experiment(
     taken = take_frames(
         sensor, n_calibration_frames + n_frames, seed, workers, bar.part("frames"), keep=folder
     )
-    campaign, frames = (
-        taken.part(0, n_calibration_frames),
-        taken.part(n_calibration_frames, len(taken.rotations)),
-    )
+    campaign = taken.part(0, n_calibration_frames)
+    frames = taken.part(n_calibration_frames, len(taken.rotations))
     found, counts = _campaign(campaign, sensor, stars)
     calibrations = {
         name: calibrate(found.observations, sensor.nominal(), method=name) for name in PAPER_METHODS

@@ -31,15 +31,13 @@ TABLE_3: tuple[Printed, ...] = tuple(
     for quantity, text in zip((RATE, *AXES), row, strict=True)
 )
 # Section 3.4: the sensor, its calibration by the proposed method, and the frames.
-FIELD_DEG, PIXEL_UM, FOCAL_MM, X0_PX, Y0_PX, K1, K2 = (
-    10.8,
-    5.5,
-    44.38,
-    1142.06,
-    1058.62,
-    -3.7e-9,
-    3.93e-16,
-)
+FIELD_DEG = 10.8
+PIXEL_UM = 5.5
+FOCAL_MM = 44.38
+X0_PX = 1142.06
+Y0_PX = 1058.62
+K1 = -3.7e-9
+K2 = 3.93e-16
 N_CHOSEN, N_TAKEN, MORE_THAN_STARS = 200, 600, 6
 
 # A data sheet gives whole millimetres, the centre of the detector, and no distortion.

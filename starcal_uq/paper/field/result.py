@@ -30,12 +30,10 @@ from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification
 from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
 
 FIELD_REPORT = "field.html"
-AS_IT_STANDS, ALIGNED, BOTH, NEITHER = (
-    "against the true attitude",
-    "after alignment",
-    "either way",
-    "no",
-)
+AS_IT_STANDS = "against the true attitude"
+ALIGNED = "after alignment"
+BOTH = "either way"
+NEITHER = "no"
 
 
 @dataclass(frozen=True, eq=False)

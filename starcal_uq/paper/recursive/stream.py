@@ -153,11 +153,9 @@ class RecursiveCalibration:
         recursion = self._recursion
         if recursion is None:
             prior = prior_of(self.nominal, self.options, bool(self._per_star))
-            q, scale, sigma = (
-                len(prior.deviation),
-                prior.scale[: len(prior.deviation)],
-                prior.reference_px,
-            )
+            q = len(prior.deviation)
+            scale = prior.scale[: len(prior.deviation)]
+            sigma = prior.reference_px
             theta = self.nominal.theta[:q]
             covariance, chi2, dof, stars = np.diag((scale * prior.deviation) ** 2), 0.0, 0.0, 0
         else:

@@ -119,10 +119,8 @@ def error_readings(found: Reproduction, quantity: str) -> TextTable:
     """
     rows, marks = [], []
     for reading in ERROR_READINGS[quantity]:
-        cells, fits = (
-            [reading.words if reading.faithful else f"{reading.words} (against the text)"],
-            [],
-        )
+        cells = [reading.words if reading.faithful else f"{reading.words} (against the text)"]
+        fits = []
         for method in PAPER_METHODS:
             draws = found.readings.of(AS_PRINTED, method, quantity, reading.key)
             if len(draws) < 2:
