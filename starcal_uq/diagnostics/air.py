@@ -230,7 +230,8 @@ class _Air:
         if not len(places):
             return None
         below = self._alone.below(places)
-        rest, columns = self._rest, self._rest.cleared(below)
+        rest = self._rest
+        columns = self._rest.cleared(below)
         most = (self._most_dof, self._seed)
         p_value, amplitude, std = _largest(rest, columns, *most)
         found = AirTest(p_value, amplitude, std, n_frames=rest.obs.n_frames)
@@ -266,7 +267,8 @@ class _Air:
         )
 
     def _of_each_frame(self, rest: Images) -> AirTest | None:
-        own, k = self._own_shapes(rest), rest.obs.n_frames
+        own = self._own_shapes(rest)
+        k = rest.obs.n_frames
         if _f_tail(_explained(rest, own), len(own), rest) >= AIR_P:
             return None
         settled = of_each_frame(rest, self._alone)
@@ -300,7 +302,8 @@ class _Air:
         these.
         """
         self.seen_px = shift_px
-        f_px, alike = self.f_px(shift_px), rest is self._alone
+        f_px = self.f_px(shift_px)
+        alike = rest is self._alone
         amplitude, std = _density(settled)
         return replace(
             found,
@@ -325,7 +328,8 @@ class _Air:
 
         `fitted` is how many numbers of the air the frames' own shapes have determined.
         """
-        left, rows = rest.e - column, self._own_shapes(rest)
+        left = rest.e - column
+        rows = self._own_shapes(rest)
         explained = float(np.sum((rows @ left) ** 2))
         tail = _f_tail(explained, max(len(rows) - fitted, 1), rest, float(left @ left))
         return tail > AIR_P or explained < _INEXACT * float(column @ column)

@@ -210,7 +210,8 @@ def diagnose_apart(
     sample.
     """
     cal, whole = without_ties(obs, cal), whole if whole is None else without_ties(obs, whole)
-    stars, rest = star_test(obs, cal), remainder(obs, cal, seed)
+    stars = star_test(obs, cal)
+    rest = remainder(obs, cal, seed)
     misfit = misfit_tests(obs, whole or cal)
     asked, assessed = extended(obs, whole or cal, misfit)
     return Apart(
@@ -290,11 +291,13 @@ def diagnose(
     seed = seed_of(seed)
     step = progress or (lambda done, total: None)
     models = rivals(cal.camera.distortion) if models is None else models
-    obs, theta = weighed(obs, cal), cal.theta
+    obs = weighed(obs, cal)
+    theta = cal.theta
     # What stars say of their model they say without rotations that others measured.
     cal = whole = without_ties(obs, cal)
     if obs.n_frames < whole.n_frames and whole.partitions is not None:
-        effects, model = whole.known_effects.names, whole.nominal.model
+        effects = whole.known_effects.names
+        model = whole.nominal.model
         cal = calibrate(obs, whole.nominal, model=model, effects=effects, duplicates="keep")
     # Two tests leave frames out.
     normals = None if cal.known_effects.fitted else FrameNormals.at(obs, cal)

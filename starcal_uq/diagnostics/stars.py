@@ -145,7 +145,8 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         The data and the estimate made from them. Stars are told apart by `star_id` where all have
         one, else by direction.
     """
-    obs, focal = without_effects(weighed(obs, cal), cal), float(cal.theta[2])
+    obs = without_effects(weighed(obs, cal), cal)
+    focal = float(cal.theta[2])
     numbers = star_numbers(obs, focal)
     normals = StarNormals.at(obs, cal, numbers)
     found = _likeness(obs, cal, numbers)
@@ -230,7 +231,8 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     rotations = cal.rotations[np.isin(cal.frame_ids, obs.frame[used])]
     stars = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
     sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
-    p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
+    p = len(cal.theta)
+    likelihood = MarginalLikelihood(frames, cal.camera.distortion)
     gram = np.zeros((p + 1, p + 1))
     for part, state, columns, rows in likelihood.linearised(
         cal.theta, cal.sigmas, rotations, _STARS_AT_ONCE

@@ -95,7 +95,8 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     search = Search(settings.solver, settings.max_iterations)
-    made, refinement = settings.made, None
+    made = settings.made
+    refinement = None
     if settings.method == "efficient":
         refinement = replace(search, tolerance=_gain(likelihood, _LAST_STEP), seen=False)
         # A solver and a limit of the iterations are those of every stage.
@@ -317,7 +318,8 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
     pair_theta = start.stages[-1].theta
     found = refine(frames, model, pair_theta, start.rotations, nu, search.max_iterations)
     if settings.dof is None and found.nu < DEFAULT_DOF:
-        nu, near = DEFAULT_DOF, found.stage.theta
+        nu = DEFAULT_DOF
+        near = found.stage.theta
         found = refine(frames, model, near, found.state.rotations, nu, search.max_iterations)
     theta = found.stage.theta
     sigma = found.sigma
@@ -373,7 +375,8 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, search: Search) -> lis
     many frames that it saves time, or where the sample or all frames from its estimate do not
     converge.
     """
-    frames, some = pairs.frames, _sample(pairs.frames)
+    frames = pairs.frames
+    some = _sample(pairs.frames)
     if some is frames:
         return []
     sample = PairObjective(some, pairs.model_name)

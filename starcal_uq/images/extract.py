@@ -105,7 +105,8 @@ def extract_centroids(
     sources, messages = _sources(images)
     detection = DetectionOptions(**options)
     task = _Measure(sources, camera, detection, bayer)
-    kept, many = None, len(sources) >= _WORTH_PROCESSES
+    kept = None
+    many = len(sources) >= _WORTH_PROCESSES
     if keep is not None and many:
         kept = Kept(
             keep, ["centroids", _files(sources), camera, detection, bayer], (_Frame, FrameStars)

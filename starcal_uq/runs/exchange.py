@@ -86,7 +86,8 @@ def export(
     if isinstance(what, str | os.PathLike):
         is_file = os.path.isfile(split_part(what)[0])
         what = Camera.load(what) if is_file else Run(what)
-    name, run = "camera", None
+    name = "camera"
+    run = None
     if isinstance(what, Run):
         name, run, what = what.name, what, what.best
     place = Path(f"{name}-{to}{FORMATS[to]}" if path is None else path)
@@ -140,8 +141,10 @@ def uncertain_values(
     """
     opened = Run(what) if isinstance(what, str | os.PathLike) else what
     best = opened.best if isinstance(opened, Run) else opened
-    camera, covariance = _camera_of(best), best.covariance
-    names, mean = camera.parameter_names, camera.theta.tolist()
+    camera = _camera_of(best)
+    covariance = best.covariance
+    names = camera.parameter_names
+    mean = camera.theta.tolist()
     with extra("uncertain", "uncertain numbers"):
         if library == "uncertainties":
             from uncertainties import correlated_values

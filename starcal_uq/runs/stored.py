@@ -318,7 +318,8 @@ class StoredRun:
     @property
     def calibrated(self) -> Results:
         """Data and estimate alone, for what is shown while the rest is not there yet."""
-        truth, calibration = self.truth, self.calibration
+        truth = self.truth
+        calibration = self.calibration
         if truth is not None and truth.parameter_names != calibration.parameter_names:
             truth = None
         return Results(self.name, self.observations, calibration, truth=truth, place=self.place)

@@ -239,7 +239,8 @@ def calibrate_source(
             nominal = found.rounds[0][0].nominal
         else:
             assert camera is not None
-            obs, nominal = read_stars(source, camera, **place, **_of(TableOptions, options)), camera
+            obs = read_stars(source, camera, **place, **_of(TableOptions, options))
+            nominal = camera
         watch.read(obs, nominal)
         with watch.bar("passes over the files") as progress:
             # Priors may determine what the data leave open.
