@@ -377,7 +377,7 @@ def test_figures_drawn_ahead_by_another_process_are_the_same(full):
 
 def test_figures_that_are_only_written_look_like_all_others(full, monkeypatch):
     results = sc.Run(full.path).results
-    written = draw_figures(results)
+    written = {path.stem: path.read_bytes() for path in full.figures.glob("*.svg")}
     assert len(written) > 10
     quick = drawing._figure(results, "corner")
     monkeypatch.setattr(drawing, "WRITTEN", ContextVar("nobody asks", default=False))
