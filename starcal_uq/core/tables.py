@@ -67,6 +67,8 @@ def read_cells(
     """
     if ending != ".parquet":
         return _read_text(path, data, ecsv=ending == ".ecsv")
+    import pyarrow as pa
+
     with opened(path, data) as file:
         names = list(file.schema_arrow.names)
         own = [name for name in names if wanted is None or name in wanted]
@@ -77,7 +79,11 @@ def read_cells(
         # Before anything becomes Python's: texts of all rows would take longer than the rest.
         rows = np.flatnonzero(np.isin(table.column(chosen[0]).to_numpy(), chosen[1]))
         table = table.take(rows)
-    return RawTable(arrow_columns(table), names, rows + 1, "row", meta)
+    found = RawTable(arrow_columns(table), names, rows + 1, "row", meta)
+    del table
+    # Arrow would keep what the table took for a next one.
+    pa.default_memory_pool().release_unused()
+    return found
 
 
 @contextmanager
@@ -133,6 +139,10 @@ def _arrow_values(column: Any) -> Any:
     if pa.types.is_timestamp(kind):
         texts = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
         return ["" if text == "NaT" else text for text in texts.tolist()]
+    if pa.types.is_string(kind):
+        # Equal texts are one object: names of stars come again in every frame.
+        coded = column.fill_null("").dictionary_encode().combine_chunks()
+        return coded.dictionary.to_numpy(zero_copy_only=False)[coded.indices].tolist()
     return ["" if value is None else str(value) for value in column.to_pylist()]
 
 

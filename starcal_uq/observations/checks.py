@@ -253,9 +253,10 @@ def _check_repeats(columns: AnyMapping, rows: IntArray) -> list[Problem]:
     ]
     if "star_id" in columns:
         # Names as numbers, which sort faster; a star without a name repeats none.
-        codes = np.unique(columns["star_id"], return_inverse=True)[1]
-        named = rows[columns["star_id"][rows] != ""]
-        searches.insert(0, ("star_id", "the same star", named, (codes,)))
+        names = np.ascontiguousarray(columns["star_id"])
+        letters = names.view(np.int32).reshape(len(names), -1)
+        named = rows[(names != "")[rows]]
+        searches.insert(0, ("star_id", "the same star", named, (row_hashes(*letters.T),)))
     repeats: dict[int, Problem] = {}
     for name, what, among, keys in searches:
         for late, early in _repeats(frame[among], *(key[among] for key in keys)):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 # Stars of a frame that are kept, and of those the ones by whose triangles frames are looked up.
-_MARKS, _CORNERS = 12, 5
+_MARKS, _CORNERS, _TRIANGLES = 12, 5, 10
 # Positions of one image by two programs may be off by another origin, px; stars are paired over
 # twice that.
 _SHIFT = 1.5
@@ -258,21 +258,13 @@ def _lookalikes(marks: Fingerprints) -> tuple[IntArray, IntArray]:
     """
     from scipy.spatial import cKDTree
 
-    n = len(marks.sizes)
-    # Corners as complex numbers, which are sorted from left to right; NaN comes last.
-    x, y = np.moveaxis(marks.padded(marks.xy_px)[:, :_CORNERS], 2, 0)
-    corners, chosen = np.sort(x + 1j * y, axis=1), list(combinations(range(_CORNERS), 3))
-    start, one, other = [corners[:, at].ravel() for at in np.transpose(chosen)]
-    # Median length of two normal errors, so that wrong stars do not count.
-    reach = _REACH_SIGMAS * (float(np.median(marks.error_px)) / 1.1774 + 1e-4)
-    points = np.column_stack([start, one - start, other - start]).view(np.float64)
-    points /= np.repeat([_REACH_PX, reach, reach], 2)
+    n, points = len(marks.sizes), _triangles(marks)
     # Most have no other near in four of the coordinates; a tree of the rest is small.
     place = np.flatnonzero(np.isfinite(points[:, 5]))
     place = place[_crowded(points[place, 2:].T)]
     points = points[place]
     # The triangle of the first three corners is every frame's first.
-    frame, which = np.divmod(place, len(chosen))
+    frame, which = np.divmod(place, _TRIANGLES)
     first = which == 0
     tree = cKDTree(points)
     near = tree.query(points, _NEAREST, p=np.inf, distance_upper_bound=1.0)[1]
@@ -284,6 +276,22 @@ def _lookalikes(marks: Fingerprints) -> tuple[IntArray, IntArray]:
         tree.query_ball_point(points[first], 1.0, p=np.inf, return_length=True) - 1
     )
     return pairs, partners
+
+
+def _triangles(marks: Fingerprints) -> FloatArray:
+    """Triangles (10 K, 6) of the most central stars, frame by frame: a corner and the ways to the
+    other two, x and y of each, in units of how far those that look alike may differ.
+    """
+    # Corners as complex numbers, which are sorted from left to right; NaN comes last.
+    x, y = np.moveaxis(marks.padded(marks.xy_px)[:, :_CORNERS], 2, 0)
+    corners = np.sort(x + 1j * y, axis=1)
+    start, *others = np.transpose(list(combinations(range(_CORNERS), 3)))
+    sides = [corners[:, start], *(corners[:, other] - corners[:, start] for other in others)]
+    points = np.stack(sides, axis=-1).reshape(-1, 3).view(np.float64)
+    # Median length of two normal errors, so that wrong stars do not count.
+    reach = _REACH_SIGMAS * (float(np.median(marks.error_px)) / 1.1774 + 1e-4)
+    points /= np.repeat([_REACH_PX, reach, reach], 2)
+    return points
 
 
 def _crowded(points: FloatArray) -> BoolArray:
