@@ -8,6 +8,7 @@ per axis is ``tau^2`` and what the catalogue states on top.
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.terms import Term
+from starcal_uq.observations.rows import locked
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -28,10 +30,22 @@ _SAME_NAME_PX, _SAME_NAME_RAD = 5.0, 6e-4
 _NAMES_AT_ONCE = 100_000
 
 
+# Numbers of the stars of tables, and the focal lengths that they were found with.
+_KNOWN: WeakKeyDictionary[Observations, tuple[float, IntArray]] = WeakKeyDictionary()
+
+
 def star_numbers(obs: Observations, focal_px: float) -> IntArray:
     """Star of every image (N,), numbered from 0 by direction, or by name where all stars have
-    one.
+    one; those that were found last are kept with the table.
     """
+    focal, numbers = _KNOWN.get(obs, (None, None))
+    if numbers is None or focal != focal_px:
+        numbers = locked(_numbered(obs, focal_px))
+        _KNOWN[obs] = focal_px, numbers
+    return numbers
+
+
+def _numbered(obs: Observations, focal_px: float) -> IntArray:
     names = obs.star_id
     named = names is not None and bool(np.all(names != ""))
     tolerance = max(_SAME_NAME_PX / focal_px, _SAME_NAME_RAD) if named else _SAME_PX / focal_px
