@@ -322,7 +322,7 @@ def test_only_the_command_line_spells_commands(root):
 WITHOUT_NAMESAKE = {
     "attitude": "earth",
     "budgeting": "posterior result sampling",
-    "calibration": "calibrate methods",
+    "calibration": "methods",
     "camera": "fields formats",
     "cli": "answers console results run schema settings starters",
     "comparison": "covariance result significance",
@@ -330,7 +330,7 @@ WITHOUT_NAMESAKE = {
     "diagnostics": "explain misfit_test noise_tests residuals shape_sums",
     "estimation": (
         "assemble duplicates kept local_effects normals "
-        "partitioned_effects residual_map result scales settings stages undetermined "
+        "partitioned_effects residual_map scales settings stages undetermined "
         "weights"
     ),
     "identification": "brightness engine growth match nearby outcome pairs proposers pyramid result sheet",
