@@ -136,16 +136,16 @@ def spread(
     `take` gets places of items with their results, as they come. After Ctrl-C what waits is
     dropped, and what was under way is taken.
     """
+    if executor is None:
+        with interrupt_between_steps() as check, one_thread():
+            for place, item in enumerate(items):
+                take([(place, function(item))])
+                check()
+        return
     with (
         interrupt_between_steps() as check,
         TemporaryDirectory(ignore_cleanup_errors=True) as folder,
     ):
-        if executor is None:
-            with one_thread():
-                for place, item in enumerate(items):
-                    take([(place, function(item))])
-                    check()
-            return
         content, path = _pickled(function), Path(folder, "function.pickle")
         # A file, because a process that dies while it starts would leave this one waiting at a pipe
         # that is full.
