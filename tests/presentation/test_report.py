@@ -13,7 +13,6 @@ import shutil
 import signal
 import sys
 import time
-from contextvars import ContextVar
 from html.parser import HTMLParser
 from multiprocessing import active_children
 
@@ -27,7 +26,6 @@ from starcal_uq.diagnostics.verdict.remedies import Place
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.pages import printing
-from starcal_uq.presentation.report import drawing
 from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
@@ -373,18 +371,6 @@ def test_figures_drawn_ahead_by_another_process_are_the_same(full):
     if processors() > 1:
         assert drawn == draw_figures(results, names)
     assert {path.stem for path in full.figures.iterdir()} <= set(FIGURES)
-
-
-def test_figures_that_are_only_written_look_like_all_others(full, monkeypatch):
-    results = sc.Run(full.path).results
-    written = {path.stem: path.read_bytes() for path in full.figures.glob("*.svg")}
-    assert len(written) > 10
-    quick = drawing._figure(results, "corner")
-    monkeypatch.setattr(drawing, "WRITTEN", ContextVar("nobody asks", default=False))
-    plain = drawing._figure(results, "corner")
-    n_quick, n_plain = (len(figure.findobj()) for figure in (quick, plain))
-    assert n_quick < n_plain
-    assert draw_figures(results) == written
 
 
 def test_another_process_that_fails_or_is_killed_is_no_obstacle(monkeypatch):

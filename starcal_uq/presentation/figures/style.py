@@ -12,7 +12,6 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable
-from contextvars import ContextVar
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, cast
@@ -50,24 +49,15 @@ _TICKS = 5
 BARS: AnyDict = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
 
 
-# Whether figures are only written, so that nobody looks for the artists on them.
-WRITTEN: ContextVar[bool] = ContextVar("WRITTEN", default=False)
-
-
 def new_figure(width_in: float, height_in: float) -> Figure:
     """The figure that a user gave, or an empty one that no window manager knows of and that shows
     itself in a notebook.
     """
     if (given := GIVEN.get()) is not None:
         return cast("Figure", given)
-    kind = _quick_figure() if WRITTEN.get() else _notebook_figure()
-    return kind(figsize=(width_in, height_in), layout="constrained", facecolor="white")
-
-
-def _quick_figure() -> type[Figure]:
-    from starcal_uq.presentation.figures.quick import QuickFigure
-
-    return QuickFigure
+    return _notebook_figure()(
+        figsize=(width_in, height_in), layout="constrained", facecolor="white"
+    )
 
 
 @cache
@@ -121,7 +111,7 @@ def new_axes(width_in: float, height_in: float) -> Axes:
     In a notebook the figure is handed to pyplot, because only then does the notebook show it below
     the cell although the caller holds the Axes; elsewhere pyplot is left alone.
     """
-    if GIVEN.get() is None and not WRITTEN.get() and _in_notebook():
+    if GIVEN.get() is None and _in_notebook():
         from matplotlib import pyplot
 
         figure = pyplot.figure(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import tomllib
 from collections.abc import Callable, Collection
 from concurrent.futures import BrokenExecutor, Executor, Future
@@ -17,7 +18,7 @@ from typing import Any, TypeVar
 from starcal_uq.core.tasks import processes, submit, worth_starting
 from starcal_uq.core.types import Progress
 from starcal_uq.pipeline.inspection import Frames
-from starcal_uq.presentation.figures.style import WRITTEN, figure_of, label, new_axes, svg_bytes
+from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
 from starcal_uq.presentation.report.results import Results
 
 T = TypeVar("T")
@@ -44,6 +45,8 @@ def draw_figures(
         figure = _figure(results, name)
         if figure is not None:
             drawn[name] = svg_bytes(figure)
+            if (pyplot := sys.modules.get("matplotlib.pyplot")) is not None:
+                pyplot.close(figure)  # A notebook would show it below the cell.
         if progress is not None:
             progress(done + 1, len(names))
     return drawn
@@ -62,11 +65,7 @@ def _figure(results: Results, name: str) -> Any:
     shown = [reduce(_part, what.split("."), results) for what in needed]
     if any(part is None for part, what in zip(shown, needed, strict=True) if what != "truth"):
         return None
-    token = WRITTEN.set(True)
-    try:
-        drawn = resolve_name(f"starcal_uq.presentation.figures.{where}")(*shown)
-    finally:
-        WRITTEN.reset(token)
+    drawn = resolve_name(f"starcal_uq.presentation.figures.{where}")(*shown)
     return None if drawn is None else figure_of(drawn)
 
 
@@ -137,7 +136,6 @@ def _load() -> None:
     # A figure is thousands of objects that refer to each other: looking for those that can go takes
     # a fifth of the time, and a dozen of them fit into memory.
     gc.disable()
-    WRITTEN.set(True)
     ax = new_axes(1.0, 1.0)
     label(ax, "", "x")
     svg_bytes(figure_of(ax))
