@@ -225,6 +225,8 @@ def _extended(covariance: FloatArray, response: FloatArray) -> tuple[FloatArray,
     """
     joint = np.vstack([np.eye(len(covariance)), response])
     correlation, sigma = correlation_of(joint @ covariance @ joint.T)
+    # The last bit of a one would show as 1.0000 beside 1.00.
+    np.fill_diagonal(correlation, np.rint(np.diag(correlation)))
     return correlation, sigma[-3:]
 
 

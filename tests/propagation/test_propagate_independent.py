@@ -529,6 +529,7 @@ def test_a_coupling_is_its_covariance_said_otherwise() -> None:
         ("single_frame_correlation", covariance @ response.T / np.outer(sigma, single)),
     ):
         np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-8, err_msg=name)
+    assert np.diag(found.extended_correlation).tolist() == [1.0] * 8
     values, vectors = np.linalg.eigh(extended[:5, :5])
     for direction, value, vector in zip(
         found.weak_directions, values[::-1], vectors.T[::-1], strict=True
