@@ -37,8 +37,10 @@ def cli(unpainted, painting_cli, monkeypatch):
     for budgets as many as resolve 99.7 %; two other starts.
     """
     monkeypatch.setattr("starcal_uq.propagation.propagate._SAMPLES", 4000)
-    small = partial(budget.budget, n_samples=10_000)
-    monkeypatch.setattr(budget, "budget", small)
+    # The package keeps what it has once looked up: its name is replaced, and given back, too.
+    small = partial(sc.budget, n_samples=10_000)
+    for place in (sc, budget):
+        monkeypatch.setattr(place, "budget", small)
     starts = diagnose.multi_start
     monkeypatch.setattr(
         diagnose, "multi_start", lambda obs, cal, n, seed=0: starts(obs, cal, min(n, 2), seed)

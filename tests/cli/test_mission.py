@@ -47,15 +47,16 @@ def small_plans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A camera, and plans over fewer attitudes and campaigns, without sweeps: what the options mean
     does not depend on how many there are.
     """
-    from starcal_uq.planning import check, design, open_distortion, plan
+    from starcal_uq.planning import open_distortion, plan
 
     sc.paper.paper_start().save(tmp_path / "camera.toml")
-    small = partial(plan.plan, n_geometries=300, n_campaigns=40, sweeps=False)
-    monkeypatch.setattr(plan, "plan", small)
+    less = {"n_geometries": 300, "n_campaigns": 40, "sweeps": False}
+    monkeypatch.setattr(sc, "plan", partial(sc.plan, **less))
+    choose, check = sc.planning.choose_frames, sc.planning.check_forecast
     monkeypatch.setattr(
-        design, "choose_frames", partial(design.choose_frames, candidates=300, n_geometries=100)
+        sc.planning, "choose_frames", partial(choose, candidates=300, n_geometries=100)
     )
-    monkeypatch.setattr(check, "check_forecast", partial(check.check_forecast, n_geometries=300))
+    monkeypatch.setattr(sc.planning, "check_forecast", partial(check, n_geometries=300))
     for name in ("_SWEEP_GEOMETRIES", "_TRIED_ATTITUDES"):
         monkeypatch.setattr(plan, name, 200)
     monkeypatch.setattr(open_distortion, "_GEOMETRIES", 100)
@@ -206,7 +207,7 @@ def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
 
 
 def test_plan_before_any_data(cli, run, tmp_path, small_plans, monkeypatch):
-    monkeypatch.setitem(sc.planning.plan.plan.keywords, "sweeps", True)
+    monkeypatch.setitem(sc.plan.keywords, "sweeps", True)
     cal = sc.Calibration.load(run / "calibration.json")
     cal.camera.save(tmp_path / "calibrated.toml")
     words = "plan calibrated.toml --target-arcsec 20 --frames 30 --frames 300"
