@@ -57,7 +57,8 @@ def to_plain(
     `arrays` takes arrays under the names of their fields (``stages`` holds ``stage0_cost``,
     ``stage1_cost``...), or those of the fields `apart` alone, which are then left out of the
     result; without it they become lists. `null` writes what is not finite as None, because strict
-    JSON has no other word for it, and `from_plain` reads NaN. TypeError for a value that no file of ours can hold.
+    JSON has no other word for it; `from_plain` reads it as NaN. TypeError for a value that no file
+    of ours can hold.
     """
 
     def plain(value: Any, name: str) -> Any:

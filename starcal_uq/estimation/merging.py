@@ -281,8 +281,8 @@ def check_mergeable(
         if cal.has_tails:
             raise CalibrationError(
                 f"{name}: was calibrated with the likelihood 'student_t', which does not add up in "
-                "compressed form: calibrate it with the marginal likelihood, or calibrate all observations "
-                "together."
+                "compressed form: calibrate it with the marginal likelihood, or calibrate all "
+                "observations together."
             )
         if fitted := cal.known_effects.fitted:
             held = ", ".join(effect.name for effect in fitted)

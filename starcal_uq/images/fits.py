@@ -34,10 +34,10 @@ class Stamps:
     `y0` (n,) on.
 
     Stars are along the last axis of all arrays here, so that NumPy's inner loops run over stars and
-    not over a few pixels. `counts` are above the background, 0 where not `fine`; `good` are pixels to use, `fine` those
-    that are good, or no loss: those between, in a mosaic of colours, hold the mean of their
-    neighbours. `variance` (n,) is that of the background, counts squared; `counts_per_e` the
-    inverse gain, and 0 leaves photon noise of the star away.
+    not over a few pixels. `counts` are above the background, 0 where not `fine`; `good` are pixels
+    to use, `fine` those that are good, or no loss: those between, in a mosaic of colours, hold the
+    mean of their neighbours. `variance` (n,) is that of the background, counts squared;
+    `counts_per_e` the inverse gain, and 0 leaves photon noise of the star away.
     """
 
     x0: IntArray

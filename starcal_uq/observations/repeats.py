@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import combinations
+from math import comb
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 # Stars of a frame that are kept, and of those the ones by whose triangles frames are looked up.
-_MARKS, _CORNERS, _TRIANGLES = 12, 5, 10
+_MARKS, _CORNERS = 12, 5
+_TRIANGLES = comb(_CORNERS, 3)
 # Positions of one image by two programs may be off by another origin, px; stars are paired over
 # twice that.
 _SHIFT = 1.5

@@ -87,8 +87,9 @@ class Ahead:
 
     def __enter__(self) -> Ahead:
         n_others = min(worth_starting(), 1)
-        for name in _SHARED * n_others:
-            import_module(name)
+        if n_others:
+            for name in _SHARED:
+                import_module(name)
         self._pool = self._end.enter_context(processes(n_others, "run", alike=True))
         others = set(active_children())
         # What drawing needs takes a second to load.
