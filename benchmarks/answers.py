@@ -16,11 +16,12 @@ MIDDLE_PX = (511.5, 383.5)
 @dataclass(frozen=True)
 class Agreement:
     """How far a rival's answer is from ours, in words, and whether they are the same for all that
-    matters.
+    matters; in words what `ours` is, where each answer is described for itself.
     """
 
     words: str
     same: bool
+    ours: str = ""
 
 
 Same = Callable[[Mapping[str, Any], Mapping[str, Any]], Agreement]
@@ -86,7 +87,7 @@ def same_frames(table: Path) -> Same:
     the places in each frame, which takes up attitude, lens and which pixel counts first.
     """
 
-    def words(result: Mapping[str, Any], rms: float) -> str:
+    def words(result: Mapping[str, Any], *rest: str) -> str:
         frames = result["frames"]
         found = judged_frames(table, frames)
         wrong = sum(apart_deg > 0.05 or right < 0.95 * n for apart_deg, right, n in found)
@@ -95,16 +96,24 @@ def same_frames(table: Path) -> Same:
         )
         steps = 1e3 * np.diff([f["clock"] for f in frames], axis=1)
         (c, i), (slow_c, slow_i) = np.median(steps, axis=0), np.max(steps, axis=0)
-        return (
-            f"{len(found) - wrong} of {len(frames)} frames, {wrong} wrong (farthest "
-            f"{max(f[0] for f in found):.3f}°), "
-            f"{n_right} of {n_stars} stars right, {rms:.3f} px, centroids {c:.1f} ms (worst "
-            f"{slow_c:.1f}), identification {i:.1f} ms (worst {slow_i:.1f})"
+        return "<br>".join(
+            (
+                f"{len(found) - wrong} of {len(frames)} frames, {wrong} wrong (farthest "
+                f"{max(f[0] for f in found):.3f}°)",
+                f"{n_right} of {n_stars} stars right",
+                f"centroids {c:.1f} ms (worst {slow_c:.1f})",
+                f"identification {i:.1f} ms (worst {slow_i:.1f})",
+                *rest,
+            )
         )
 
     def compare(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
         rms = scatter(table, [[f["points"] for f in result["frames"]] for result in (ours, rival)])
-        return Agreement(f"{words(rival, rms[1])}; ours {words(ours, rms[0])}", True)
+        return Agreement(
+            words(rival, f"scatter {rms[1]:.3f} px, of the same stars ours {rms[0]:.3f}"),
+            True,
+            words(ours),
+        )
 
     return compare
 
@@ -193,5 +202,7 @@ def scatter(table: Path, measured: Sequence[Sequence[Any]]) -> list[float]:
 
 
 def counted(words: str) -> Same:
-    """Ours and theirs, side by side: no two programs find the same."""
-    return lambda ours, rival: Agreement(f"{rival['found']} {words}, ours {ours['found']}", True)
+    """Each program's own count: no two find the same."""
+    return lambda ours, rival: Agreement(
+        f"{rival['found']} {words}", True, f"{ours['found']} {words}"
+    )

@@ -296,7 +296,7 @@ def images(per_frame: dict[str, Any]) -> list[Row]:
 
     def found(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
         words = (f"{one['found']} frames, {one['wrong']} wrong" for one in (rival, ours))
-        return Agreement("; ours ".join(words), True)
+        return Agreement(next(words), True, next(words))
 
     made = [
         Row(

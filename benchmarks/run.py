@@ -169,6 +169,7 @@ def record(row: Row, runs: Sequence[Runs], load: Sequence[float]) -> dict[str, A
                 common = min(set(mine.turns) & set(run.turns))
                 agreement = row.same(mine.turns[common].result, run.turns[common].result)
                 entry["answer"], entry["same"] = agreement.words, agreement.same
+                listed[0]["answer"] = agreement.ours
                 for clock in CLOCKS:
                     found = ratio(run, mine, clock, row.amount)
                     entry[f"{clock}_ratio"] = found and vars(found)
@@ -249,7 +250,7 @@ def times(found: Mapping[str, float] | None) -> str:
 
 
 OURS = "starcal_uq"
-HEAD = ("", "First call", "Processor (wall)", "Times ours", "Peak MB", "Beside our answer")
+HEAD = ("", "First call", "Processor (wall)", "Times ours", "Peak MB", "Answer")
 
 
 def table(records: Sequence[Mapping[str, Any]]) -> str:
