@@ -194,12 +194,21 @@ def check_names(
             )
 
 
+# Degrees in the unit that the name of a column ends with.
+_ANGLE_UNIT = re.compile(r".*[ _\[(](?P<unit>h|hours?|rad|radians?)[\])]?", re.IGNORECASE)
+_DEGREES = {"h": "15", "r": "57.29577951308232"}
+
+
 def say_column(missing: Sequence[str], names: Sequence[str]) -> str:
     """How to map `missing` columns to the `names` in a file, with a guess where one begins alike."""
     options = []
     for name in missing:
-        near = [own for own in names if own.lower().startswith(name.split("_")[0])]
-        options.append(f'--column "{name}={near[0] if len(near) == 1 else "NAME"}"')
+        quantity, _, unit = name.partition("_")
+        near = [own for own in names if own.lower().startswith(quantity)]
+        own = near[0] if len(near) == 1 else "NAME"
+        if unit == "deg" and (other := _ANGLE_UNIT.fullmatch(own)):
+            own += f" * {_DEGREES[other['unit'][0].lower()]}"
+        options.append(f'--column "{name}={own}"')
     return (
         f"the file has {listed(names)}: give {' '.join(options)}, or columns={{...}} in Python, "
         "with names from the file"

@@ -1,6 +1,7 @@
 """Files of observations, and the report of every bad row."""
 
 import csv
+import re
 from functools import partial
 from pathlib import Path
 
@@ -457,6 +458,14 @@ def test_missing_columns(tmp_path):
     assert (error.row, error.column, len(error.problems)) == (None, "y_px", 3)
     near = write_csv(tmp_path / "near.csv", [row[:3] for row in ROWS], ["frame", "Xpix", "RA"])
     assert '--column "x_px=Xpix" --column "y_px=NAME" --column "ra_deg=RA"' in str(caught(near))
+    # The guess for hours and radians can be followed as it stands.
+    rows = [[*r[:3], float(r[3]) / 15.0, np.radians(float(r[4]))] for r in ROWS]
+    others = write_csv(tmp_path / "units.csv", rows, [*HEADER[:3], "RA [h]", "dec_rad"])
+    given = dict(re.findall(r'--column "(\w+)=([^"]+)"', str(caught(others))))
+    plain = load_observations(write_csv(tmp_path / "obs.csv", ROWS))
+    obs = load_observations(others, columns=given)
+    np.testing.assert_allclose(obs.ra_deg, plain.ra_deg, rtol=1e-14)
+    np.testing.assert_allclose(obs.dec_deg, plain.dec_deg, rtol=1e-14)
     twice = write_csv(tmp_path / "twice.csv", [[*row, "1"] for row in ROWS], [*HEADER, "x_px"])
     assert "column x_px occurs twice" in str(caught(twice))
 
