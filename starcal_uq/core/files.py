@@ -101,6 +101,21 @@ def new_folder(path: PathLike) -> Path:
     return path
 
 
+def default_cache_dir() -> Path:
+    """The platform's folder for files that can be made again, with this package's name."""
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base) / "starcal_uq"
+    if sys.platform == "win32":  # pragma: no cover
+        return (
+            Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+            / "starcal_uq"
+            / "Cache"
+        )
+    if sys.platform == "darwin":  # pragma: no cover
+        return Path.home() / "Library" / "Caches" / "starcal_uq"
+    return Path.home() / ".cache" / "starcal_uq"
+
+
 @contextmanager
 def atomic_path(path: PathLike, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds; if not,

@@ -19,6 +19,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.files import default_cache_dir
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, Progress, floats
@@ -33,7 +34,6 @@ from starcal_uq.identification.growth import GrownField, Patch, grow, matched_pa
 from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.outcome import identification, moved
-from starcal_uq.identification.pairs import default_cache_dir
 from starcal_uq.identification.proposers import Proposer, offered_engine, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.result import (

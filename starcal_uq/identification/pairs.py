@@ -10,8 +10,6 @@ sorted by angle too, and a table of equal steps says where each step begins: tho
 from __future__ import annotations
 
 import hashlib
-import os
-import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -268,21 +266,6 @@ def cached(kind: type[F], name: str, make: Callable[[], F], folder: PathLike | N
         with atomic_path(path) as temporary:
             np.savez(temporary, **{name: getattr(made, name) for name in _names(kind)})
     return made
-
-
-def default_cache_dir() -> Path:
-    """The platform's folder for files that can be made again, with this package's name."""
-    if base := os.environ.get("XDG_CACHE_HOME"):
-        return Path(base) / "starcal_uq"
-    if sys.platform == "win32":  # pragma: no cover
-        return (
-            Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-            / "starcal_uq"
-            / "Cache"
-        )
-    if sys.platform == "darwin":  # pragma: no cover
-        return Path.home() / "Library" / "Caches" / "starcal_uq"
-    return Path.home() / ".cache" / "starcal_uq"
 
 
 def _names(kind: Any) -> list[str]:

@@ -96,12 +96,21 @@ def template_environment() -> Environment:
     """
     import jinja2
 
+    from starcal_uq.presentation.words.sentences import (
+        CompiledTemplates,
+        functions,
+        rows,
+        say,
+        told,
+    )
+
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("starcal_uq.presentation"),
         autoescape=jinja2.select_autoescape(disabled_extensions=["txt.j2"], default=True),
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
+        bytecode_cache=CompiledTemplates(),
     )
     environment.filters |= {
         "symbol": symbol,
@@ -110,8 +119,6 @@ def template_environment() -> Environment:
         "wrapped": wrapped,
         "when": lambda utc: utc.replace("T", " ").replace("Z", " UTC"),
     }
-    from starcal_uq.presentation.words.sentences import functions, rows, say, told
-
     environment.globals |= {"rows": rows, "say": say, "told": told}
     environment.globals |= functions(formatting)
     environment.globals["TextTable"] = TextTable

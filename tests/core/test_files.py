@@ -16,6 +16,7 @@ from starcal_uq.core.files import (
     atomic_write_bytes,
     cell_content,
     cell_text,
+    default_cache_dir,
     write_csv,
 )
 from starcal_uq.runs.folder import RunFolder
@@ -91,3 +92,8 @@ def test_a_disk_that_refuses_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(RunFolderError, match="second: cannot be written"):
         atomic_write_bytes(tmp_path / "second", b"content")
+
+
+def test_cache_folder_of_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache_dir() == tmp_path / "starcal_uq"

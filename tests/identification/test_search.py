@@ -25,7 +25,6 @@ from starcal_uq.identification.engine import identify
 from starcal_uq.identification.pairs import (
     angle_between,
     cached_star_pairs,
-    default_cache_dir,
     find_star_pairs,
 )
 from starcal_uq.identification.pyramid import (
@@ -430,11 +429,6 @@ def test_pairs_are_complete_and_cached(tmp_path: Path) -> None:
     # Another catalogue has another file.
     cached_star_pairs(directions, mag + 1e-9, 0.04, 0.2, folder)
     assert len(list(folder.iterdir())) == 2
-
-
-def test_cache_folder_of_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_cache_dir() == tmp_path / "starcal_uq"
 
 
 def test_triangles_do_not_stay_with_one_star() -> None:

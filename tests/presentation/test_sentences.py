@@ -12,7 +12,9 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import jinja2
 import numpy as np
 import pytest
 
@@ -36,7 +38,7 @@ from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.inference.priors import Stated
 from starcal_uq.likelihood.noise_model import Noise
 from starcal_uq.pipeline.images import Told
-from starcal_uq.presentation.words.sentences import templates, told
+from starcal_uq.presentation.words.sentences import CompiledTemplates, templates, told
 from starcal_uq.sky.apparent import Horizon
 
 PACKAGE = Path(status.__file__).parents[1]
@@ -164,3 +166,35 @@ def test_no_list_asks_for_its_own_loop_before_it_runs() -> None:
     asking = re.compile(r"{%[^%]*\bfor\b[^%]* if [^%]*\bloop\b")
     assert [name for name, text in templates().items() if asking.search(text)] == []
     assert asking.search("{% for a in b if c[loop.index0] %}")
+
+
+def test_compiled_templates_are_kept_and_damaged_ones_compiled_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    compiled = []
+    compile_it = jinja2.Environment.compile
+
+    def counted(*given: Any, **options: Any) -> Any:
+        compiled.append(given)
+        return compile_it(*given, **options)
+
+    monkeypatch.setattr(jinja2.Environment, "compile", counted)
+
+    def filled() -> int:
+        """Templates compiled in a fresh environment."""
+        compiled.clear()
+        loader = jinja2.DictLoader({"sum": "{{ a + b }}"})
+        environment = jinja2.Environment(loader=loader, bytecode_cache=CompiledTemplates())
+        assert environment.get_template("sum").render(a=1, b=2) == "3"
+        return len(compiled)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert [filled(), filled()] == [1, 0]
+    (kept,) = (path for path in tmp_path.rglob("*") if path.is_file())
+    whole = kept.read_bytes()
+    for damage in (b"", b"no template", whole[: len(whole) // 2], whole[: len(whole) - 1]):
+        kept.write_bytes(damage)
+        assert [filled(), filled()] == [1, 0]
+    # A file is in the way of the folder.
+    monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
+    assert [filled(), filled()] == [1, 1]
