@@ -19,6 +19,7 @@ import numpy as np
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import as_plain, check_size, open_parquet, reading
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray, floats
 
 if TYPE_CHECKING:
@@ -103,16 +104,23 @@ def write_parquet(
     import pyarrow as pa
     from pyarrow import parquet
 
-    table = pa.table(
-        {
-            name: values.tolist()
-            if getattr(values, "dtype", None) and values.dtype.kind == "U"
-            else values
-            for name, values in columns.items()
-        }
-    )
+    table = pa.table({name: _of_arrow(values) for name, values in columns.items()})
     options = {"compression": "zstd", **options}
     parquet.write_table(table.replace_schema_metadata({key: meta}), path, **options)
+
+
+def coded(texts: Texts) -> Any:
+    """Texts as an array of arrow that holds their codes."""
+    import pyarrow as pa
+
+    return pa.DictionaryArray.from_arrays(texts.codes, texts.names.tolist())
+
+
+def _of_arrow(values: Any) -> Any:
+    if isinstance(values, Texts):
+        return coded(values).dictionary_decode()
+    is_text = isinstance(values, np.ndarray) and values.dtype.kind == "U"
+    return values.tolist() if is_text else values
 
 
 def own_meta(schema: pa.Schema, key: bytes = META_KEY) -> AnyDict:
@@ -139,10 +147,13 @@ def _arrow_values(column: Any) -> Any:
     if pa.types.is_timestamp(kind):
         texts = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
         return ["" if text == "NaT" else text for text in texts.tolist()]
-    if pa.types.is_string(kind):
-        # Equal texts are one object: names of stars come again in every frame.
-        coded = column.fill_null("").dictionary_encode().combine_chunks()
-        return coded.dictionary.to_numpy(zero_copy_only=False)[coded.indices].tolist()
+    if any(
+        is_it(kind)
+        for is_it in (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
+    ):
+        coded = column.dictionary_encode().unify_dictionaries().combine_chunks()
+        texts = ["" if value is None else str(value) for value in coded.dictionary.to_pylist()]
+        return Texts.placed(coded.indices.fill_null(len(texts)), [*texts, ""])
     return ["" if value is None else str(value) for value in column.to_pylist()]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.files import shown
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.core.units import plain
 
@@ -48,12 +49,13 @@ def julian_days(
     is understood), `datetime.datetime` or `numpy.datetime64`, UTC without an offset, or a `Time` of
     astropy. CatalogueError quotes one that is not readable, with its place among several, from 1.
     """
-    times = np.atleast_1d(np.asarray(plain("time_utc", time_utc))).astype(str)
-    unique, inverse = np.unique(times, return_inverse=True)
+    times = plain("time_utc", time_utc)
+    if not isinstance(times, Texts):
+        times = Texts.of(np.ravel(times).astype(str))
     days = np.array(
-        [_days(str(text), times, ut1_minus_utc_s) for text in unique], dtype=np.float64
+        [_days(text, times, ut1_minus_utc_s) for text in times.names.tolist()], dtype=np.float64
     ).reshape(-1, 2, 2)
-    return days[:, 0], days[:, 1], inverse.reshape(-1).astype(np.int64)
+    return days[:, 0], days[:, 1], times.codes.astype(np.int64)
 
 
 def julian_year(time_utc: Any) -> float:

@@ -24,6 +24,7 @@ from starcal_uq.camera.distortion import (
     shared_names,
 )
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 
@@ -295,13 +296,13 @@ def _clock_in(obs: Observations, extent: Extent) -> FloatArray | None:
 
 def seconds_utc(times: StrArray) -> FloatArray | None:
     """Seconds since 1970 of times (N,); None where one of them cannot be read."""
-    unique, inverse = np.unique(times, return_inverse=True)
+    texts = Texts.of(times)
     try:
-        parsed = [datetime.fromisoformat(str(text)) for text in unique]
+        parsed = [datetime.fromisoformat(text) for text in texts.names.tolist()]
     except ValueError:
         return None
     stamps = [(t if t.tzinfo is not None else t.replace(tzinfo=UTC)).timestamp() for t in parsed]
-    return floats(stamps)[inverse.reshape(-1)]
+    return floats(stamps)[texts.codes]
 
 
 def frame_shapes(camera: Camera) -> Shape:

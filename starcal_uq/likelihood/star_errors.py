@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.terms import Term
@@ -27,7 +28,6 @@ _SAME_PX = 0.3
 # Stars of one name are one star within this: aberration and proper motion move a direction from
 # frame to frame.
 _SAME_NAME_PX, _SAME_NAME_RAD = 5.0, 6e-4
-_NAMES_AT_ONCE = 100_000
 
 
 # Numbers of the stars of tables, and the focal lengths that they were found with.
@@ -46,22 +46,16 @@ def star_numbers(obs: Observations, focal_px: float) -> IntArray:
 
 
 def _numbered(obs: Observations, focal_px: float) -> IntArray:
-    names = obs.star_id
+    names = None if obs.star_id is None else Texts.of(obs.star_id)
     named = names is not None and bool(np.all(names != ""))
     tolerance = max(_SAME_NAME_PX / focal_px, _SAME_NAME_RAD) if named else _SAME_PX / focal_px
     place = _linked(obs.directions_icrs, tolerance)
     if not named or names is None:
         return place
     # A name alone is not trusted: numbers that start again with every frame are no names of stars.
-    first = names[first_of_each(place)]
-    blocks = np.array_split(np.arange(len(place)), len(place) // _NAMES_AT_ONCE + 1)
-    if all(np.array_equal(first[place[rows]], names[rows]) for rows in blocks):
-        # Sorting the names of all images would take longer than all else.
-        rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
-        return np.asarray(rank[place], dtype=np.int64)
-    code = np.unique(names, return_inverse=True)[1]
-    code = code * (int(place.max()) + 1) + place
-    return np.asarray(np.unique(code, return_inverse=True)[1], dtype=np.int64)
+    code = names.codes.astype(np.int64) * (int(place.max()) + 1) + place
+    # Places among the few stars are found sooner than all images are sorted.
+    return np.searchsorted(np.unique(code), code)
 
 
 def first_of_each(numbers: IntArray) -> IntArray:

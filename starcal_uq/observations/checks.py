@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.types import AnyMapping, BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.core.texts import Texts
+from starcal_uq.core.types import AnyMapping, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
@@ -129,21 +130,20 @@ def parse_whole(name: str, cells: Sequence[str]) -> tuple[IntArray, list[Problem
     return np.array(values, dtype=np.int64), problems
 
 
-def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem]]:
+def parse_times(name: str, cells: Sequence[str]) -> tuple[Texts, list[Problem]]:
     """Times of a column of texts as YYYY-MM-DDTHH:MM:SS[.f], shape (N,); empty where a cell is
     bad.
     """
-    known: dict[str, str] = {}
-
-    def convert(cell: str) -> str:
-        # All stars of a frame share their time.
-        if cell not in known:
-            known[cell] = _iso_utc(cell)
-        return known[cell]
-
+    texts = Texts.of(cells)
     remedy = "write UTC as in 2026-11-21T01:02:03.5"
-    values, problems = _parse(name, cells, convert, "", "is not an ISO 8601 time in UTC", remedy)
-    return np.array(values, dtype=np.str_), problems
+    # All stars of a frame share their time.
+    values, found = _parse(
+        name, texts.names.tolist(), _iso_utc, "", "is not an ISO 8601 time in UTC", remedy
+    )
+    bad = {problem.row: problem for problem in found}
+    rows = np.flatnonzero(np.isin(texts.codes, list(bad)))
+    problems = [replace(bad[texts.codes[row]], row=int(row)) for row in rows]
+    return Texts.placed(texts.codes, values), problems
 
 
 def check_columns(
@@ -160,7 +160,7 @@ def check_columns(
             wrong = np.isinf(values) if COLUMNS[name].gaps else ~np.isfinite(values)
             problems += _each(name, values, wrong, "is not a finite number")
     if "time_utc" in columns:
-        problems += parse_times("time_utc", columns["time_utc"].tolist())[1]
+        problems += parse_times("time_utc", columns["time_utc"])[1]
     ra, dec = columns["ra_deg"], columns["dec_deg"]
     # 360 is let pass: rounding to a few decimals turns 359.99999999 into it.
     outside = (ra < 0.0) | (ra > 360.0)
@@ -252,11 +252,10 @@ def _check_repeats(columns: AnyMapping, rows: IntArray) -> list[Problem]:
         ("x_px", "the same pixel position", rows, (columns["x_px"], columns["y_px"])),
     ]
     if "star_id" in columns:
-        # Names as numbers, which sort faster; a star without a name repeats none.
-        names = np.ascontiguousarray(columns["star_id"])
-        letters = names.view(np.int32).reshape(len(names), -1)
+        # A star without a name repeats none.
+        names = Texts.of(columns["star_id"])
         named = rows[(names != "")[rows]]
-        searches.insert(0, ("star_id", "the same star", named, (row_hashes(*letters.T),)))
+        searches.insert(0, ("star_id", "the same star", named, (names.codes,)))
     repeats: dict[int, Problem] = {}
     for name, what, among, keys in searches:
         for late, early in _repeats(frame[among], *(key[among] for key in keys)):

@@ -23,6 +23,7 @@ from starcal_uq.core.files import (
     table_ending,
 )
 from starcal_uq.core.tables import REMEDY, WHAT, RawTable, in_unit, opened, own_meta, read_cells
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import (
     AnyDict,
     BoolArray,
@@ -153,13 +154,12 @@ def column_behind(text: str, names: Sequence[str]) -> str:
 def _number_frames(raw: RawTable, own: str) -> None:
     """Number frames that have names, such as those of images, as they come."""
     cells = raw.columns.get(own)
-    if isinstance(cells, np.ndarray) and cells.dtype.kind == "U":
-        cells = cells.tolist()
-    if isinstance(cells, list) and not any(
-        re.match(r"\s*([-+.]?\d[\d.e+-]*)?\s*$", cell) for cell in cells
-    ):
-        found = {cell: number for number, cell in enumerate(dict.fromkeys(cells))}
-        raw.columns[own] = np.array([found[cell] for cell in cells], dtype=np.int64)
+    if cells is None or (isinstance(cells, np.ndarray) and cells.dtype.kind != "U"):
+        return
+    texts = Texts.of(cells)
+    if not any(re.match(r"\s*([-+.]?\d[\d.e+-]*)?\s*$", cell) for cell in texts.names):
+        found = {cell: number for number, cell in enumerate(dict.fromkeys(texts))}
+        raw.columns[own] = np.array([found[cell] for cell in texts.names])[texts.codes]
         names = list(found)
         raw.meta["frame_names"] = f"0 is {shown(names[0])}, {len(names) - 1} is {shown(names[-1])}"
 
@@ -259,10 +259,8 @@ def convert_columns(
         elif kind == "time":
             columns[name], bad = parse_times(name, cells)
         else:
-            texts = [cell.strip() for cell in cells]
-            columns[name] = np.array(
-                list(map(cell_content, texts)) if raw.spreadsheet else texts, dtype=np.str_
-            )
+            texts = Texts.of(cells).map(str.strip)
+            columns[name] = texts.map(cell_content) if raw.spreadsheet else texts
         problems += bad
     for name in converted.keys() & columns.keys():
         factor, shift = converted[name]

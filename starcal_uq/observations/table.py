@@ -21,6 +21,7 @@ from starcal_uq.attitude.rotations import unit_vectors
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.settings import Directions
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.times import utc_text
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.core.units import plain
@@ -49,7 +50,9 @@ class Observations(FrameRows, Sourced, Shown):
     """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
 
     Rows given in another order are sorted by frame; within a frame they keep their order. The
-    arrays are copies and cannot be written to.
+    arrays are copies and cannot be written to. Columns of texts are views that NumPy takes as
+    arrays of str: ``codes`` (N,), places in the few different ``names`` (see
+    `starcal_uq.core.texts.Texts`).
 
     Attributes
     ----------
@@ -161,12 +164,13 @@ class Observations(FrameRows, Sourced, Shown):
         digest = hashlib.sha256()
         for name, values in self.unweighted.columns.items():
             digest.update(f"{name}:{len(values)};".encode())
+            if isinstance(values, Texts):
+                # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
+                values = values.map(lambda text: f"{len(text)}:{text}")
             for first in range(0, len(values), _ROWS_AT_ONCE):
                 part = values[first : first + _ROWS_AT_ONCE]
-                if values.dtype.kind == "U":
-                    # The length before each text: without it ("ab", "c") and ("a", "bc") would
-                    # agree.
-                    digest.update("".join(f"{len(t)}:{t}" for t in part.tolist()).encode())
+                if isinstance(part, Texts):
+                    digest.update("".join(part).encode())
                 else:
                     # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
                     part = part + values.dtype.type(0)
@@ -365,8 +369,9 @@ class Observations(FrameRows, Sourced, Shown):
 
     def with_time(self, time: Any) -> Observations:
         """The same table with a time (UTC; text, datetime or astropy Time) for rows without one."""
+        text = utc_text(time)
         there = np.full(len(self), "") if self.time_utc is None else self.time_utc
-        return replace(self, time_utc=np.where(there == "", utc_text(time), there))
+        return replace(self, time_utc=Texts.of(there).map(lambda stated: stated or text))
 
     def __repr__(self) -> str:
         return (
@@ -410,8 +415,9 @@ def load_observations(
     tables = [load_observations(one, camera, columns) for one in path]
     if not tables:
         raise ObservationError("observations: there is no file; give at least one.")
-    common = [name for name in tables[0].columns if all(name in table.columns for table in tables)]
-    joined = {name: np.concatenate([table.columns[name] for table in tables]) for name in common}
+    columns_of = [table.columns for table in tables]
+    common = [name for name in columns_of[0] if all(name in columns for columns in columns_of)]
+    joined = {name: _joined([columns[name] for columns in columns_of]) for name in common}
     starts = np.cumsum([0, *(table.n_frames for table in tables)])
     joined["frame"] = np.concatenate(
         [np.searchsorted(t.frame_ids, t.frame) + n for t, n in zip(tables, starts, strict=False)]
@@ -425,12 +431,9 @@ def load_observations(
 def _array(name: str, values: Any) -> Any:
     """A one-dimensional copy of `values` in the type of column `name`."""
     kind = COLUMNS[name].kind
+    if kind in ("text", "time") and np.ndim(values) == 1:
+        return Texts.of(values)
     array = np.asarray(values)
-    if kind in ("text", "time") and array.dtype.kind == "O":
-        # pandas marks a missing text by None or NaN, which would become the words "None" and "nan".
-        array = np.array(
-            ["" if v is None or v != v else str(v) for v in array.tolist()], dtype=np.str_
-        )
     if (
         kind == "whole"
         and array.dtype.kind == "f"
@@ -457,10 +460,16 @@ def joined_columns(tables: Sequence[Observations], **instead: Sequence[FloatArra
         if all(missing) or (any(missing) and not column.gaps):
             continue
         gap: Any = "" if column.kind == "text" else np.nan
-        columns[name] = np.concatenate(
+        columns[name] = _joined(
             [
                 np.full(len(table), gap) if v is None else v
                 for table, v in zip(tables, values, strict=True)
             ]
         )
     return columns
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """A column of several tables, one after the other."""
+    texts = any(isinstance(part, Texts) for part in parts)
+    return Texts.joined(parts) if texts else np.concatenate(parts)

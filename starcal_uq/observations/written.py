@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +20,9 @@ from starcal_uq.core.files import (
     ensure_new,
     table_ending,
 )
-from starcal_uq.core.tables import write_parquet
-from starcal_uq.core.types import AnyDict, AnyMapping, IntArray, PathLike, StrArray
+from starcal_uq.core.tables import coded, write_parquet
+from starcal_uq.core.texts import Texts
+from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import WRITTEN
 from starcal_uq.observations.matches import corr_content, fits_content
@@ -101,24 +101,12 @@ def _csv_text(columns: AnyMapping) -> str:
 
 def write_partition(
     columns: AnyMapping,
-    named: Mapping[str, tuple[IntArray, StrArray]],
     meta: AnyDict,
     path: Path,
 ) -> None:
-    """Write one Parquet file of a folder of partitions, atomically and quickly; overwritten.
-
-    `columns` (N,) are numbers; of texts, `named` has for each row its place (N,) in a list of
-    different ones.
-    """
-    import pyarrow as pa
-
-    arrays: AnyDict = {name: pa.array(values) for name, values in columns.items()}
-    for name, (place, texts) in named.items():
-        used, place = np.unique(place, return_inverse=True)
-        arrays[name] = pa.DictionaryArray.from_arrays(
-            pa.array(place.astype(np.int32)), pa.array(texts[used].tolist())
-        )
-    arrays = {name: arrays[name] for name in COLUMNS if name in arrays}
+    """Write one Parquet file of a folder of partitions, atomically and quickly; overwritten."""
+    arrays = {name: columns[name] for name in COLUMNS if name in columns}
+    arrays |= {name: coded(text) for name, text in arrays.items() if isinstance(text, Texts)}
     # Pixels repeat nowhere: looking for repeats in them, or compressing them, would take longer
     # than all the rest.
     pixels = {"x_px", "y_px"}

@@ -15,6 +15,7 @@ from starcal_uq.core.errors import ObservationError, RunFolderError, SettingErro
 from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
@@ -190,13 +191,12 @@ class _Maker:
             "y_px": xy[:, 1],
             "ra_deg": stars.ra_deg[star],
             "dec_deg": stars.dec_deg[star],
+            "star_id": Texts.placed(star, stars.star_id),
             "mag": stars.mag[star],
         }
         if one_noise(self.tracker.noise) is None:
             columns["sigma_px"] = sigma
-        write_partition(
-            columns, {"star_id": (star, stars.star_id)}, meta, self.folder / _NAME.format(number)
-        )
+        write_partition(columns, meta, self.folder / _NAME.format(number))
 
 
 def _make_all(

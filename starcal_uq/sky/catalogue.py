@@ -16,6 +16,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.settings import KEYS, bounded
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.sky.apparent import aberrate, check_velocity
 from starcal_uq.sky.gaia import (
@@ -127,8 +128,9 @@ class StarCatalogue(Shown):
 
     def named(self, index: Any) -> AnyDict:
         """Directions, names and magnitudes of some stars, as columns of a table."""
-        names = ("ra_deg", "dec_deg", "star_id", "mag")
-        return {name: getattr(self, name)[index] for name in names}
+        names = ("ra_deg", "dec_deg", "mag")
+        columns = {name: getattr(self, name)[index] for name in names}
+        return {**columns, "star_id": Texts.placed(index, self.star_id)}
 
     @bounded
     def at_epoch(self, epoch: float) -> StarCatalogue:

@@ -13,6 +13,7 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.records import hash_of
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, ensemble_draws
 from starcal_uq.inference.named import quick_target
@@ -239,7 +240,7 @@ def observe(
         ra_deg=ra,
         dec_deg=dec,
         sigma_px=noise if uneven else None,
-        star_id=stars.star_id[geometry.star],
+        star_id=Texts.placed(geometry.star, stars.star_id),
         mag=geometry.mag,
         direction_mas=np.full(len(xy), error) if error > 0.0 else None,
         meta=Origin(SIMULATED, "apparent").plain(),

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.observed import refraction
 from starcal_uq.presentation.html import card, listed
@@ -31,8 +30,8 @@ def run_html(results: Results) -> str:
 def data_sentence(results: Results) -> str:
     """What the result rests on, in one or two sentences."""
     obs, cal = results.observations, results.calibration
-    stars = () if obs.star_id is None else np.unique(obs.star_id)
-    return told("data", results, n_different=len(stars), refraction=refraction(obs, cal))
+    n_different = 0 if obs.star_id is None else len(Texts.of(obs.star_id).names)
+    return told("data", results, n_different=n_different, refraction=refraction(obs, cal))
 
 
 # What makes sums over all stars, by the name that a provenance has for it.
