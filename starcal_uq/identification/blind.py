@@ -106,6 +106,9 @@ def _threes(k: int) -> IntArray:
     return np.array(list(combinations(range(1, k + 1), 3)), dtype=np.int64)
 
 
+_IN_KEY = [1, 0, 3, 2]
+
+
 def quads_of(neighbours: IntArray) -> IntArray:
     """Different sets of four (q, 4): a point, first in its row of `neighbours` (n, k + 1), and
     three of its nearest.
@@ -113,14 +116,13 @@ def quads_of(neighbours: IntArray) -> IntArray:
     three = _threes(neighbours.shape[1] - 1)
     own = np.repeat(neighbours[:, 0], len(three))[:, None]
     quads = np.sort(np.hstack([own, neighbours[:, three].reshape(-1, 3)]), axis=1)
-    # Two keys are sorted faster than rows of four.
-    n = int(quads.max(initial=0)) + 1
-    keys = (quads[:, 0] * n + quads[:, 1], quads[:, 2] * n + quads[:, 3])
-    order = np.lexsort(keys)
-    new = np.ones(len(quads), dtype=np.bool_)
-    one, two = (key[order] for key in keys)
-    new[1:] = (one[1:] != one[:-1]) | (two[1:] != two[:-1])
-    return quads[order[new]]
+    # One key, or two, are sorted faster than rows of four: the last number of a key counts most.
+    kind = "<u2" if quads.max(initial=0) < 1 << 16 else "<u4"
+    keys = quads[:, _IN_KEY].astype(kind, order="C").view("<u8")
+    keys = np.sort(keys, axis=0) if keys.shape[1] == 1 else keys[np.lexsort(keys.T)]
+    new = np.ones(len(keys), dtype=np.bool_)
+    new[1:] = np.any(keys[1:] != keys[:-1], axis=1)
+    return keys[new].view(kind)[:, _IN_KEY].astype(np.int64)
 
 
 # Of four points, the ends of each side and the other two.
@@ -136,7 +138,7 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     d.
     """
     # Patterns along the last axis, so that NumPy's inner loops run over them.
-    v = directions.T[:, quads.T]
+    v = directions.T.take(quads.T, axis=1)
     p = np.einsum("ikq,aiq->akq", v, axes_along(v, 0, 1))
     p = (p[0] + 1j * p[1]) / p[2]
     apart = p[_ENDS[0]] - p[_ENDS[1]]
@@ -241,8 +243,9 @@ def make_level(directions: FloatArray) -> Level:
     codes = codes.astype(np.float32)
     n = 1 << len(codes).bit_length()
     place = _places(np.floor(codes / _CELL).astype(np.int64) @ _BYTES, n)
-    order = np.argsort(place, kind="stable")
-    start = np.searchsorted(place[order], np.arange(n + 1)).astype(np.int32)
+    # A sort of numbers that end in their places takes half the time of a stable `argsort`.
+    order = np.sort((place << 32) + np.arange(len(place))) & 0xFFFFFFFF
+    start = np.append(0, np.cumsum(np.bincount(place, minlength=n))).astype(np.int32)
     return Level(directions, quads[order].astype(np.int32), size[order], codes[order], start)
 
 

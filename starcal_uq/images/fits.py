@@ -34,16 +34,16 @@ class Stamps:
     `y0` (n,) on.
 
     Stars are along the last axis of all arrays here, so that NumPy's inner loops run over stars and
-    not over a few pixels. `counts` are above the background, 0 where not `fine`; `good` are pixels
-    to use, `fine` those that are good, or no loss: those between, in a mosaic of colours, hold the
-    mean of their neighbours. `variance` (n,) is that of the background, counts squared;
-    `counts_per_e` the inverse gain, and 0 leaves photon noise of the star away.
+    not over a few pixels. `counts` are above the background, 0 where not `fine`; `good` is 1 for
+    pixels to use and 0 for others, `fine` are those that are good, or no loss: those between, in a
+    mosaic of colours, hold the mean of their neighbours. `variance` (n,) is that of the background,
+    counts squared; `counts_per_e` the inverse gain, and 0 leaves photon noise of the star away.
     """
 
     x0: IntArray
     y0: IntArray
     counts: FloatArray
-    good: BoolArray
+    good: FloatArray
     fine: BoolArray
     variance: FloatArray
     counts_per_e: float = 0.0
@@ -51,7 +51,8 @@ class Stamps:
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
         names = ("x0", "y0", "counts", "good", "fine", "variance")
-        changes: AnyDict = {name: getattr(self, name)[..., chosen] for name in names}
+        # Indexing would put the stars first in memory.
+        changes: AnyDict = {name: getattr(self, name).take(chosen, axis=-1) for name in names}
         return replace(self, **changes)
 
     def whole_within(self, x: FloatArray, y: FloatArray, radius: FloatArray) -> BoolArray:
@@ -100,7 +101,7 @@ def cut_stamps(frame: PreparedImage, x: FloatArray, y: FloatArray, half_px: int)
     good = inside if usable is None else inside & usable.take(at)
     fine = good if parity is None else good | (inside & ((columns + rows) % 2 != parity))
     stamp = floats(np.where(fine, counts.take(at), 0.0))
-    return Stamps(x0, y0, stamp, good, fine, variance, frame.counts_per_e)
+    return Stamps(x0, y0, stamp, floats(good), fine, variance, frame.counts_per_e)
 
 
 def _profiles(
@@ -210,7 +211,7 @@ def _settled(
     for iteration in range(_ITERATIONS):
         if iteration and len(moving) <= left_moving * n:
             break
-        u, v, flux, log_sigma = state if part is stamps else state[:, moving]
+        u, v, flux, log_sigma = state if part is stamps else state.take(moving, axis=1)
         sigma = np.exp(log_sigma)
         px, py = _profiles(part, u, v, sigma, 1 + free_sigma)
         if iteration == 0:
@@ -253,7 +254,7 @@ def _to_their_end(step: FloatArray, last: FloatArray, moving: IntArray) -> Float
 
     `last` (q, n) are the steps before, and become these.
     """
-    before = last[:, moving]
+    before = last.take(moving, axis=1)
     size = np.einsum("qk,qk->k", before, before)
     ratio = np.einsum("qk,qk->k", step, before) / np.where(size > 0.0, size, 1.0)
     longer: FloatArray = step / (1.0 - np.minimum(np.maximum(ratio, -1.0), 0.5))
@@ -317,7 +318,7 @@ def _of_others(stamps: Stamps, state: FloatArray, pairs: IntArray, stars: IntArr
     others = np.zeros((*stamps.counts.shape[:2], len(stars)))
     if len(pairs):
         here, there = pairs.T
-        u, v, flux, log_sigma = state[:, there]
+        u, v, flux, log_sigma = state.take(there, axis=1)
         du, dv = stamps.x0[there] - stamps.x0[here], stamps.y0[there] - stamps.y0[here]
         px, py = _profiles(stamps, u + du, v + dv, np.exp(log_sigma), 0)
         first = np.flatnonzero(np.diff(here, prepend=-1))
@@ -393,12 +394,12 @@ def window_positions(
     if not len(x):
         return x, y, good
     half, moving = len(stamps.counts) // 2, np.flatnonzero(good)
-    counts = stamps.counts if good.all() else stamps.counts[..., moving]
+    counts = stamps.counts if good.all() else stamps.counts.take(moving, axis=-1)
     steps, factor = np.arange(2 * half + 1)[:, None], 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
     small, fall = np.zeros(len(x)) + step_px**2, -0.5 / window_px**2
     at, last = np.stack([x - stamps.x0, y - stamps.y0]), np.zeros((2, len(x)))
     for _ in range(_WINDOW_ITERATIONS):
-        here = at[:, moving]
+        here = at.take(moving, axis=1)
         w = steps - here[:, None]
         rows = np.empty((2, 2, *w.shape[1:]))
         np.exp(fall[moving] * w * w, out=rows[:, 0])
@@ -417,7 +418,7 @@ def window_positions(
         if not on.any():
             break
         if not on.all():
-            moving, counts = moving[on], counts[..., on]
+            moving, counts = moving[on], counts.compress(on, axis=-1)
     x, y = at[0] + stamps.x0, at[1] + stamps.y0
     radius = _WINDOW_SIGMAS * window_px
     for place, size in zip((y, x), shape, strict=True):
