@@ -9,6 +9,7 @@ are caught.
 from __future__ import annotations
 
 import gc
+import inspect
 import os
 import signal
 import sys
@@ -22,6 +23,7 @@ from starcal_uq.cli import HELP, VERSION_LINE
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # An internal software error, as `sysexits.h` numbers it.
 FAULT = 70
+_GETDOC = inspect.getdoc
 
 
 def program() -> NoReturn:
@@ -47,11 +49,20 @@ def main() -> None:
     traceback.
     """
     before = _catch(_end_at_once)
+    inspect.getdoc = _docstring
     try:
         _main()
     finally:
+        inspect.getdoc = _GETDOC
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _docstring(object: object) -> str | None:
+    """None for SciPy: it parses and extends 650 of its docstrings each time it is loaded, which
+    takes a third of the time of loading and which no command shows.
+    """
+    return None if str(getattr(object, "__module__", "")).startswith("scipy.") else _GETDOC(object)
 
 
 def _main() -> None:

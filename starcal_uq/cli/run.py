@@ -49,11 +49,12 @@ def demo_command(
 ) -> Answer:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.presentation.report.drawing import Ahead
-    from starcal_uq.runs.whole import finish
+    from starcal_uq.runs.whole import finish, load_libraries
 
     run = sc.Run(out, tell=note)
     command = {"command": "demo", "frames": frames, "seed": seed}
     with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
+        ahead.begin(load_libraries)
         truth = sc.paper.paper_camera()
         if not run.did("calibrate"):
             tell(
@@ -92,6 +93,7 @@ def run_command(
             check_files,
             finish,
             kind_of,
+            load_libraries,
             refuse_no_camera,
         )
 
@@ -135,6 +137,8 @@ def run_command(
         options["workers"] = None
     watch = watching(images.epoch)
     with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
+        if not from_images:
+            ahead.begin(load_libraries)
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
             calibrate_source(
                 run,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -195,6 +195,13 @@ class Apart:
     assessed: bool
 
 
+class LeftOut(NamedTuple):
+    """The part of a `Diagnosis` that leaves frames out."""
+
+    jackknife: Jackknife | None
+    comparison: ModelComparison | None
+
+
 @one_thread()
 def diagnose_apart(
     obs: Observations,
@@ -264,6 +271,7 @@ def diagnose(
     seed: Seed = 0,
     progress: Progress | None = None,
     apart: Callable[[], Apart | None] | None = None,
+    left_out: Callable[[], LeftOut | None] | None = None,
 ) -> Diagnosis:
     """Test the model of a calibration in every available way.
 
@@ -284,9 +292,9 @@ def diagnose(
         Seed of everything random.
     progress : callable, optional
         Called with the number of steps done and their total.
-    apart : callable, optional
-        What waits for `diagnose_apart` of the same arguments, which runs elsewhere; None of it is
-        asked for here again.
+    apart, left_out : callable, optional
+        What waits for `diagnose_apart` and `leave_frames_out` of the same arguments, which run
+        elsewhere; None of it is asked for here again.
     """
     seed = seed_of(seed)
     step = progress or (lambda done, total: None)
@@ -299,31 +307,45 @@ def diagnose(
         effects = whole.known_effects.names
         model = whole.nominal.model
         cal = calibrate(obs, whole.nominal, model=model, effects=effects, duplicates="keep")
-    # Two tests leave frames out.
-    normals = None if cal.known_effects.fitted else FrameNormals.at(obs, cal)
-    found = jackknife_of_all(whole) or _jackknife(obs, cal, normals)
-    step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)
+    step(1, 4)
+    frames = None if left_out is None else left_out()
+    if frames is None:
+        frames = leave_frames_out(obs, cal, models=models, seed=seed)
     step(2, 4)
-    # A single frame cannot be left out, and a field holds what other models would add to the lens.
-    asked = obs.n_frames > 1 and "field" not in cal.known_effects.names
-    comparison = None
-    if models and asked:
-        comparison = compare_models(obs, cal, models, seed=seed, normals=normals)
+    rest = None if apart is None else apart()
     step(3, 4)
-    rest = None if apart is None or whole.partitions is not None else apart()
     if rest is None:
         rest = diagnose_apart(obs, cal, n_starts=n_starts, seed=seed, whole=whole)
     step(4, 4)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(
         predictive=predictive,
-        jackknife=found,
-        comparison=comparison,
+        jackknife=jackknife_of_all(whole) or frames.jackknife,
+        comparison=frames.comparison,
         theta=tuple(theta.tolist()),
         provenance=provenance(seed, settings, whole.data_hash_of(obs)),
         **vars(rest),
     )
+
+
+@one_thread()
+def leave_frames_out(
+    obs: Observations,
+    cal: Calibration,
+    *,
+    models: Sequence[str] | None = None,
+    seed: int = 0,
+) -> LeftOut:
+    """The two tests that leave frames out, which share what the frames say about the parameters."""
+    cal = without_ties(obs, cal)
+    models = rivals(cal.camera.distortion) if models is None else models
+    normals = None if cal.known_effects.fitted else FrameNormals.at(obs, cal)
+    comparison = None
+    # A single frame cannot be left out, and a field holds what other models would add to the lens.
+    if models and obs.n_frames > 1 and "field" not in cal.known_effects.names:
+        comparison = compare_models(obs, cal, models, seed=seed, normals=normals)
+    return LeftOut(_jackknife(obs, cal, normals), comparison)
 
 
 def _jackknife(

@@ -11,15 +11,23 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
 
+import numpy as np
+
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.conflicts import asked, refuse_conflicts, with_effects, words_of
-from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError, SettingError
+from starcal_uq.core.errors import (
+    CalibrationError,
+    IdentificationError,
+    PriorError,
+    SettingError,
+    StarcalError,
+)
 from starcal_uq.core.manifest import identity
 from starcal_uq.core.remedy import OBS, Remedy, spoken
 from starcal_uq.core.settings import (
@@ -282,13 +290,24 @@ def sample_run(run: Run, options: AnyMapping, **others: Any) -> Posterior:
     return run.sample(**options, **others)
 
 
+def load_libraries() -> None:
+    """Load what sampling and diagnosis need: for a process that has nothing else to do yet."""
+    import starcal_uq.diagnostics.diagnose  # noqa: F401
+    from starcal_uq.inference.arviz import rhat
+    from starcal_uq.inference.ensemble import make_moves
+
+    make_moves("mixture")
+    rhat(np.eye(2, 8))
+
+
 @one_thread()
 def finish(
     run: Run, ahead: Ahead, options: AnyMapping, *, seed: int, watch: Watch, report: bool = True
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
-    from starcal_uq.diagnostics.diagnose import diagnose_apart
+    from starcal_uq.diagnostics.diagnose import diagnose_apart, leave_frames_out
     from starcal_uq.presentation.report.drawing import AFTER
+    from starcal_uq.runs.steps.posterior import is_quick, sampling_of
 
     propagation = _of(PropagationOptions, options)
     profile = propagation.get("temperature_profile")
@@ -296,18 +315,28 @@ def finish(
     if profile is not None and (effects is None or "temperature" not in effects.names):
         run._tell(f"The data support no effect of the temperature: {profile} is left out.")
         del propagation["temperature_profile"]
-    apart = None
-    # The other process draws the frames of images, which takes as long as this.
-    if run.images is None and run.calibration.partitions is None and not run.did("diagnose"):
-        apart = ahead.begin(partial(diagnose_apart, seed=seed), run.observations, run.calibration)
+    drawn, questions = None, AnyDict()
+    sampling = _of(SamplingOptions, options) | {"dof": options.get("dof")}
+    # The other process draws the frames of images, which takes as long as all this.
+    if run.images is None and run.calibration.partitions is None:
+        known: AnyDict = {"obs": run.observations, "cal": run.calibration, "seed": seed}
+        first, second = partial(diagnose_apart, **known), partial(leave_frames_out, **known)
+        if not run.did("sample") and is_quick(run, sampling):
+            drawn = ahead.begin(sampling_of(run, seed=seed, **sampling))
+        if not run.did("diagnose"):
+            questions["apart"] = ahead.begin(first) if drawn is None else cache(first)
+            questions["left_out"] = ahead.begin(second)
     watch.tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
     ahead.draw(run.calibrated, AFTER["calibration"])
     if run.images is not None:
         ahead.draw_frames(run.shown_frames)
+    if drawn is not None and questions:
+        # While the other process samples; an error comes again where it belongs.
+        with suppress(StarcalError):
+            questions["apart"]()
     if not run.did("sample"):
-        sampling = _of(SamplingOptions, options) | {"dof": options.get("dof")}
         with watch.bar("sampling") as progress:
-            sample_run(run, sampling, seed=seed, progress=progress)
+            sample_run(run, sampling, seed=seed, progress=progress, apart=drawn)
     ahead.draw(run.results, AFTER["sampling"])
     if not run.did("coupling"):
         run.couple()
@@ -316,7 +345,7 @@ def finish(
     ahead.draw(run.results, AFTER["propagation"])
     if not run.did("diagnose"):
         with watch.bar("diagnosis") as progress:
-            run.diagnose(seed=seed, progress=progress, apart=apart)
+            run.diagnose(seed=seed, progress=progress, **questions)
     ahead.draw(run.results, AFTER["diagnosis"])
     if not run.did("budget"):
         run.budget(file=options.get("budget"), seed=seed)

@@ -9,7 +9,13 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.records import to_plain
-from starcal_uq.diagnostics.diagnose import Diagnosis, diagnose, diagnose_apart, multi_start
+from starcal_uq.diagnostics.diagnose import (
+    Diagnosis,
+    LeftOut,
+    diagnose,
+    diagnose_apart,
+    multi_start,
+)
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
@@ -54,6 +60,9 @@ def test_half_of_a_diagnosis_may_be_found_elsewhere(obs, cal):
     # The control: what came from elsewhere is what stands there.
     other = dataclasses.replace(apart, starts=None)
     assert diagnose(obs, cal, **options, apart=lambda: other).starts is None
+    left = LeftOut(None, None)
+    found = diagnose(obs, cal, **options, apart=lambda: other, left_out=lambda: left)
+    assert found.jackknife is None
 
 
 def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, tmp_path):

@@ -4,6 +4,7 @@ refused.
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
@@ -15,6 +16,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.diagnostics.diagnose import Diagnosis
+from starcal_uq.runs.steps.posterior import is_quick, sampling_of
 from tests.helpers.commands import Commands
 from tests.helpers.scenes import observations
 
@@ -136,3 +138,17 @@ def test_data_of_another_calibration_are_refused_with_one_sentence(
     (tmp_path / "run.json").unlink()
     with pytest.raises(sc.errors.RunFolderError, match="made from other observations"):
         getattr(sc.Run(tmp_path), step)()
+
+
+def test_another_process_may_sample_where_that_is_quick(tmp_path: Path) -> None:
+    run = sc.Run(tmp_path / "run")
+    run.calibrate(observations(), sc.paper.paper_start())
+    assert is_quick(run, {"n_steps": 200, "priors": None})
+    # Whoever asks for more wants to see how far it is.
+    assert not is_quick(run, {"n_steps": 400})
+    few = {"n_ensembles": 2, "n_steps": 20, "seed": 1}
+    call = pickle.loads(pickle.dumps(sampling_of(run, **few)))
+    assert np.array_equal(run.sample(apart=call, **few).draws, call().draws)
+    # The control: without an answer the draws are made here, of the seed that is given.
+    here = run.sample(apart=lambda: None, force=True, **{**few, "seed": 2})
+    assert not np.array_equal(here.draws, call().draws)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import ExitStack, suppress
 from functools import partial, reduce
-from importlib import import_module
 from importlib.resources import files
 from multiprocessing import active_children
 from pkgutil import resolve_name
@@ -31,8 +30,6 @@ AFTER = {step: tuple(figures) for step, figures in _STEPS.items()}
 # The frames of a run from images stand among the figures by this name: a piece of a page, not a
 # picture.
 GALLERY = "gallery"
-# What both processes need is loaded once where they part by a fork.
-_SHARED = ("starcal_uq.diagnostics.diagnose", "scipy.ndimage", "scipy.optimize", "scipy.spatial")
 FIGURES = tuple(name for names in AFTER.values() for name in names)
 
 
@@ -87,9 +84,6 @@ class Ahead:
 
     def __enter__(self) -> Ahead:
         n_others = min(worth_starting(), 1)
-        if n_others:
-            for name in _SHARED:
-                import_module(name)
         self._pool = self._end.enter_context(processes(n_others, "run", alike=True))
         others = set(active_children())
         # What drawing needs takes a second to load.

@@ -42,7 +42,7 @@ def diagnose(run: StoredRun, /, *, force: bool = False, **options: Any) -> Diagn
     if posterior is not None and run.has("attitude"):
         run.diagnosis = diagnosis if diagnosis.is_of(run.calibration) else None
         found = with_misfit(run, run.attitude)
-    others = ("progress", "apart", "seed")
+    others = ("progress", "apart", "left_out", "seed")
     settings = {name: value for name, value in options.items() if name not in others}
     with run._step("diagnose", diagnosis.provenance.seed, settings) as files:
         for name, file_name in DIAGNOSIS_TABLES.items():
