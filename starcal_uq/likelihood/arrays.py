@@ -20,6 +20,7 @@ from starcal_uq.camera.projection import (
     backward_root,
     forward_kernel,
     forward_root,
+    slope_kernel,
     unproject_theta,
 )
 from starcal_uq.core.types import FloatArray
@@ -183,10 +184,33 @@ def gram(
     return total, slope
 
 
+def slope(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    moved: tuple[FloatArray, FloatArray, FloatArray],
+) -> FloatArray:
+    """As `starcal_uq.likelihood.paths.Sums.slope`."""
+    weight = np.linalg.inv(np.eye(2) if frames.axes is None else frames.axes).ravel()
+    kernel, total = slope_kernel(model_name), np.zeros_like(theta)
+    for first, last in frames.parts(BLOCK_STARS):
+        part, own = frames.part(first, last), slice(first, last)
+        b = part.rotated(rotations[own])
+        root = forward_root(model_name, theta, b)
+        spread = part.spread(moved[2][..., own].reshape(9, -1))
+        (found,) = kernel(part.n_stars, theta, b, root, part.pixel, weight, spread)
+        if part.weight is not None:
+            found *= part.weight**2
+        turned = np.einsum("ik,ipk->p", part.sum(found[-3:]), moved[1][..., own])
+        total += found[:-3].sum(axis=1) + turned
+    return total
+
+
 def attitudes(
     frames: StarFrames, model_name: str, theta: FloatArray, weights: FloatArray | None = None
 ) -> FloatArray:
-    """As `starcal_uq.likelihood.paths.Sums.attitudes`, with weights (N,) of the stars."""
+    """As `starcal_uq.likelihood.paths.Sums.attitudes`."""
     b = unproject_theta(model_name, theta, frames.pixel.T)
     found = quest(b, frames.r.T, frames.starts, weights, covariance=False, on_degenerate="flag")
     return found.rotations

@@ -138,6 +138,17 @@ def follow(stars: Stars, model: str, p: int) -> None:
             own[2 + 2 * t] = own[2 + 2 * t] - turned
 
 
+def gather(stars: Stars, model: str, p: int) -> None:
+    """Slopes along theta, the attitudes following, from those over (theta, phi); the first buffer
+    begins as that of the Gram matrix, without whitening.
+    """
+    with stars.each() as (common, own):
+        turns = [own[2 + 2 * (p + c)] for c in range(3)]
+        for t in range(p):
+            turned = [common[p * c + t] * turns[c] for c in range(3)]
+            own[2 * (p + 4 + t)] = added([own[2 + 2 * t], *turned])
+
+
 def _turn(stars: Stars, at: GramRows, whitening: list[Any], z: int, entries: Entries) -> None:
     """The derivatives of A along z, and half of what the path itself bends; the slope."""
     p = math.isqrt(len(whitening))

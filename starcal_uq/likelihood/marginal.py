@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.camera.projection import forward_kernel, forward_root, slope_kernel
+from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.arrays import BLOCK_STARS, attitudes
+from starcal_uq.likelihood.arrays import BLOCK_STARS
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
-from starcal_uq.likelihood.paths import path_of
+from starcal_uq.likelihood.paths import path_of, sums_for
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.likelihood.sums import (
     ATTITUDE_STEPS,
@@ -101,7 +101,7 @@ class MarginalLikelihood:
         """Attitudes (K, 3, 3) by QUEST at theta."""
         weight = self.frames.weight
         weight = None if weight is None else weight**2
-        return attitudes(self.frames, self.model_name, theta, weight)
+        return sums_for(self.frames).attitudes(self.frames, self.model_name, theta, weight)
 
     def profile(
         self,
@@ -315,20 +315,9 @@ class MarginalLikelihood:
         """Slope (p,) of minus the log likelihood at theta (p,), times ``sigma**2``; attitudes follow
         from `near`.
         """
-        frames, rotations = self.frames, near.at(theta)
-        weight = np.linalg.inv(np.eye(2) if frames.axes is None else frames.axes).ravel()
-        kernel, slope = slope_kernel(self.model_name), np.zeros_like(theta)
-        for first, last in frames.parts(BLOCK_STARS):
-            part, response = frames.part(first, last), near.response[..., first:last]
-            b = part.rotated(rotations[first:last])
-            root = forward_root(self.model_name, theta, b)
-            inverse = part.spread(sigma**2 * near.inverse[..., first:last].reshape(9, -1))
-            (found,) = kernel(part.n_stars, theta, b, root, part.pixel, weight, inverse)
-            if part.weight is not None:
-                found *= part.weight**2
-            turned = np.einsum("ik,ipk->p", part.sum(found[-3:]), response)
-            slope += found[:-3].sum(axis=1) + turned
-        return slope
+        moved = near.shift, near.response, sigma**2 * near.inverse
+        frames, model_name = self.frames, self.model_name
+        return sums_for(frames).slope(frames, model_name, theta, near.at(theta), moved)
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable

@@ -112,6 +112,20 @@ class Sums(Protocol):
         `moved` are shift, response and inverse of the frames at `rotations`.
         """
 
+    def slope(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        theta: FloatArray,
+        rotations: FloatArray,
+        moved: tuple[FloatArray, FloatArray, FloatArray],
+        /,
+    ) -> FloatArray:
+        """Slope (p,) of ``(e^T e + sigma**2 log |A^T A|) / 2`` along theta, attitudes following.
+
+        `moved` as for `gram`, the inverse times ``sigma**2``.
+        """
+
     def pairs(
         self, frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, /
     ) -> tuple[float, FloatArray, FloatArray]:
@@ -120,9 +134,16 @@ class Sums(Protocol):
         `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame.
         """
 
-    def attitudes(self, frames: StarFrames, model_name: str, theta: FloatArray, /) -> FloatArray:
-        """Attitudes (K, 3, 3) by QUEST at theta, without weights; NaN where stars determine
-        none.
+    def attitudes(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        theta: FloatArray,
+        weights: FloatArray | None = None,
+        /,
+    ) -> FloatArray:
+        """Attitudes (K, 3, 3) by QUEST at theta, with weights (N,) of the stars; NaN where stars
+        determine none.
         """
 
 

@@ -202,6 +202,7 @@ def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
     # derivative by 5e-12.
     best = settled_sums(likelihood.frames, model, theta, rotations)[1].at(theta)
     _compare_gram(likelihood, model, theta, best, plain.matrix, monkeypatch)
+    _compare_slope(likelihood, theta, where, plain.matrix, monkeypatch)
     _compare_pairs(likelihood.frames, model, theta, monkeypatch)
     # A theta at which the model is not finite is not finite on either path.
     bad = np.array(theta)
@@ -225,6 +226,20 @@ def _compare_gram(likelihood, model, theta, rotations, matrix, monkeypatch):
     assert np.max(difference) < 1e-8
     assert np.max(np.abs(fused.gram - plain.gram)) < 1e-12 * np.max(plain.gram)
     assert np.allclose(fused.log_determinant_slope, plain.log_determinant_slope, rtol=0, atol=1e-12)
+    monkeypatch.setenv(paths.SWITCH, "numba")
+
+
+def _compare_slope(likelihood, theta, attitudes, matrix, monkeypatch):
+    both = []
+    for path in ("numba", "numpy"):
+        monkeypatch.setenv(paths.SWITCH, path)
+        slope = likelihood.slope(theta, 0.7, attitudes)
+        both.append((slope / np.sqrt(np.diag(matrix)), likelihood.start_rotations(theta)))
+    (fused, turned), (plain, rotations) = both
+    # In standard deviations of a unit of noise; terms of some hundreds of them add up.
+    assert np.max(np.abs(plain)) > 1e-2
+    assert np.allclose(fused, plain, rtol=0, atol=1e-9)
+    assert np.allclose(turned, rotations, rtol=0, atol=1e-13)
     monkeypatch.setenv(paths.SWITCH, "numba")
 
 

@@ -12,10 +12,10 @@ in the first cache; a column is a row of `STRIDE` numbers in one buffer.
 
 import logging
 
-from starcal_uq.likelihood.loops.frames import gram, normals
+from starcal_uq.likelihood.loops.frames import gram, normals, slope
 from starcal_uq.likelihood.loops.pairs import attitudes, pairs
 
-__all__ = ["attitudes", "gram", "normals", "pairs"]
+__all__ = ["attitudes", "gram", "normals", "pairs", "slope"]
 
 logging.getLogger(__name__).info(
     "Loading compiled loops; compiling them at first use takes a few seconds."

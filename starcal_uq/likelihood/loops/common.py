@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,15 +19,16 @@ from starcal_uq.camera.projection import (
     bent_index,
     forward_kernel,
     newton_kernel,
+    slope_kernel,
 )
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.expansion import expand, follow
+from starcal_uq.likelihood.expansion import expand, follow, gather, packed
 from starcal_uq.likelihood.loops.unrolled import STAR_FUNCTION, STRIDE, Code, Stars, call
 from starcal_uq.observations.frames import StarFrames
 
 F = TypeVar("F", bound=Callable[..., Any])
 CHUNK = 128
-# Rows of the buffer `work`: the direction, or the pixel; the root; the target.
+# Rows of the buffer `work`: the direction, or the pixel; the root; the target, then the pixel.
 WORK = 8
 _NEWTON_STEPS = 60
 _NONE = np.empty(0)
@@ -67,12 +68,14 @@ def compiled(entry: bool = False) -> Callable[[F], F]:
 
 
 # Functions of a chunk of stars that are no kernels of the model.
-_COLUMNS = {"expand": expand, "follow": follow}
+_COLUMNS = {"expand": expand, "follow": follow, "gather": gather}
 
 
 def _kernel(what: str, model: str) -> Kernel:
     if what in ("first", "bent"):
         return forward_kernel(model, what)
+    if what == "slope":
+        return slope_kernel(model)
     return newton_kernel(model) if what == "root" else backward_kernel(model, what == "derivatives")
 
 
@@ -84,15 +87,20 @@ def _star_code(typingctx: Any, key: Any, numbers: Any, one: Any, two: Any, m: An
             _COLUMNS[what](stars, model, p)
             return context.get_dummy_value()
         kernel = _kernel(what, model)
-        reads = [(0, 1, 2), (3, 4)]
+        reads: list[Sequence[int | float]] = [(0, 1, 2), (3, 4)]
         # e, H, A and second derivatives.
-        writes = (0, 2, 2 + 2 * p, 8 + 2 * p)[: len(kernel.shapes)]
+        writes, step = (0, 2, 2 + 2 * p, 8 + 2 * p)[: len(kernel.shapes)], 1
         if what in ("direction", "derivatives"):
             # Derivatives come as rows of (p, 3).
             reads, writes = [(0, 1), (3, 4)], (0, 3)[: len(kernel.shapes)]
         elif what == "root":
             reads, writes = [(6, 7), (3, 4)], (0, 2)
-        stars.kernel(kernel, p, reads, writes)
+        elif what == "slope":
+            # Stars are weighted afterwards. One number takes the place of two axes.
+            inverse = [WORK + 3 * p + 3 + packed(i, j) for i in range(3) for j in range(3)]
+            reads += [(6, 7), (1.0, 0.0, 0.0, 1.0), inverse]
+            writes, step = (2,), 2
+        stars.kernel(kernel, p, reads, writes, step)
         return context.get_dummy_value()
 
     return types.void(key, numbers, one, two, m), codegen
@@ -111,8 +119,8 @@ def _digest(text: str = "") -> str:
 
 def star_function(what: str, model: str) -> int:
     """Address of a compiled function of a model, for a chunk of stars: ``first``, ``bent``,
-    ``direction`` and ``derivatives`` are its kernels, ``root`` solves for points, ``follow`` and
-    ``expand`` make columns.
+    ``direction``, ``derivatives`` and ``slope`` are its kernels, ``root`` solves for points,
+    ``follow``, ``expand`` and ``gather`` make columns.
 
     Only these know the model; all loops around them are compiled once.
     """
@@ -230,8 +238,8 @@ def columns_of(frames: StarFrames) -> Any:
     return tuple(map(given, (*frames.pixel, *frames.r)))
 
 
-def weighted(frames: StarFrames, rotations: FloatArray) -> tuple[Any, Any, Any, Any]:
-    weight = _NONE if frames.weight is None else frames.weight
+def weighted(frames: StarFrames, rotations: FloatArray, power: int) -> tuple[Any, Any, Any, Any]:
+    weight = _NONE if frames.weight is None else frames.weight**power
     return columns_of(frames), given(weight), given(frames.starts), given(rotations)
 
 

@@ -46,7 +46,7 @@ def _eliminated(
     """Products of the columns of all stars without what three columns of every frame reproduce.
 
     The function `kernel` makes rows of a chunk, e first, and `change` makes others of them, axis by
-    axis; it sees `frame_rows` at every star. Columns are counted from row `columns` on; the first
+    axis; both see `frame_rows` at every star. Columns are counted from row `columns` on; the first
     `free` are known to be without what is eliminated, the columns from row `attitude` on.
     """
     columns_of_stars, weight, starts, rotations = stars
@@ -56,27 +56,17 @@ def _eliminated(
     theta, shared = data(numbers[0]), data(numbers[1])
     root, kernel, change = functions
     chunk, attitude, columns, n_columns, free, n_slopes, n_rows = at
-    work, common, own = data(buffers[0]), data(buffers[1]), data(buffers[2])
+    work, own = data(buffers[0]), data(buffers[1])
     gram, acc, inverse, slope = sums
     residuals, solved, inverses, volume = of_frames
-    a = row(own, attitude)
+    common, a = row(work, WORK), row(own, attitude)
     n, first, s0 = start[len(starts) - 1], start[0], start[0]
     while s0 < n:
         m = min(chunk, n - s0)
         fill_directions(root, theta, sky, s0, m, first, work, own)
-        call(kernel, theta, work, own, m)
         for i in range(m):
-            own[i] = x0[s0 + i] - own[i]
-            own[STRIDE + i] = y0[s0 + i] - own[STRIDE + i]
-        if len(weight) > 0:
-            for k in range(n_rows):
-                of = row(own, k)
-                for i in range(m):
-                    of[i] *= w[s0 + i]
-        if residuals.shape[1] > 0:
-            for i in range(m):
-                residuals[0, s0 + i] = own[i]
-                residuals[1, s0 + i] = own[STRIDE + i]
+            work[6 * STRIDE + i] = x0[s0 + i]
+            work[7 * STRIDE + i] = y0[s0 + i]
         f, j = first, start[0]
         while j < m and len(frame_rows) > 0:
             while start[f + 1] <= s0 + j:
@@ -87,6 +77,19 @@ def _eliminated(
                 for i in range(j, end):
                     of[i] = value
             j = end
+        call(kernel, theta, work, own, m)
+        for i in range(m):
+            own[i] = work[6 * STRIDE + i] - own[i]
+            own[STRIDE + i] = work[7 * STRIDE + i] - own[STRIDE + i]
+        if len(weight) > 0:
+            for k in range(n_rows):
+                of = row(own, k)
+                for i in range(m):
+                    of[i] *= w[s0 + i]
+        if residuals.shape[1] > 0:
+            for i in range(m):
+                residuals[0, s0 + i] = own[i]
+                residuals[1, s0 + i] = own[STRIDE + i]
         for axis in range(2):
             call(change, shared, common, row(own, axis), m)
         for k in range(n_slopes):
@@ -110,7 +113,7 @@ def _eliminated(
                     a, a if c < free else row(own, columns + 2 * c), j, end, acc, 0, c + 3 - free
                 )
             j = end
-            if s0 + j == start[f + 1]:
+            if n_columns > 0 and s0 + j == start[f + 1]:
                 xx, xy, xz = acc[0, 0], acc[0, 1], acc[0, 2]
                 yy, yz, zz = acc[1, 1], acc[1, 2], acc[2, 2]
                 inverse[0], inverse[1] = yy * zz - yz * yz, xz * yz - xy * zz
@@ -137,6 +140,43 @@ def _eliminated(
         s0 += m
 
 
+def _sums(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    functions: tuple[str, str],
+    shared: tuple[FloatArray, FloatArray],
+    at: tuple[int, ...],
+    solved: FloatArray,
+    residuals: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Products and slopes of `_eliminated`, and the packed inverse and the determinant's logarithm of
+    every frame.
+    """
+    k, (numbers, by_frame), (kernel, change) = frames.n_frames, shared, functions
+    *_, n_columns, free, n_slopes, n_rows = at
+    # Groups of three fill up the last one.
+    gram, acc = np.zeros((n_columns + 2, n_columns + 2)), np.zeros((3, n_columns + 5 - free))
+    slope, inverse, volume = np.zeros(n_slopes // 2), np.empty((6, k)), np.empty(k)
+    _eliminated(
+        VERSION,
+        (
+            root_of(model_name, "forward"),
+            star_function(kernel, model_name),
+            star_function(change, model_name),
+        ),
+        (given(theta), given(numbers.ravel())),
+        weighted(frames, rotations, 2 if kernel == "slope" else 1),
+        given(by_frame),
+        at,
+        (rows(WORK + 2 * len(by_frame)), rows(n_rows + n_slopes + 2 * n_columns + 4)),
+        (gram, acc, np.empty(6), slope),
+        (np.empty((2, 0)) if residuals is None else residuals, solved, inverse, volume),
+    )
+    return symmetric(gram[:n_columns, :n_columns]), slope, inverse, volume
+
+
 def normals(
     frames: StarFrames,
     model_name: str,
@@ -146,29 +186,22 @@ def normals(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """As `starcal_uq.likelihood.paths.Sums.normals`."""
     p, k = len(theta), frames.n_frames
-    turn = common_turn(frames, model_name, theta, rotations)
-    # Groups of three fill up the last one.
-    gram, acc = np.zeros((p + 3, p + 3)), np.zeros((3, p + 6))
-    solved, inverse, volume = np.empty((3, p + 1, k)), np.empty((6, k)), np.empty(k)
-    _eliminated(
-        VERSION,
-        (
-            root_of(model_name, "forward"),
-            star_function("first", model_name),
-            star_function("follow", model_name),
-        ),
-        (given(theta), given(turn.ravel())),
-        weighted(frames, rotations),
-        given(np.empty((0, k))),
+    turn, solved = common_turn(frames, model_name, theta, rotations), np.empty((3, p + 1, k))
+    total, _, inverse, volume = _sums(
+        frames,
+        model_name,
+        theta,
+        rotations,
+        ("first", "follow"),
+        (turn, np.empty((0, k))),
         (CHUNK, 2 * p + 2, 0, p + 1, 0, 0, 2 * p + 8),
-        (rows(WORK), rows(1), rows(2 * p + 8)),
-        (gram, acc, np.empty(6), np.empty(0)),
-        (np.empty((2, 0)) if residuals is None else residuals, solved, inverse, volume),
+        solved,
+        residuals,
     )
     whole = inverse[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3, k)
     response = np.negative(solved[:, 1:])
     response -= turn[:, :, None]
-    return symmetric(gram[: p + 1, : p + 1]), solved[:, 0], response, whole, volume
+    return total, solved[:, 0], response, whole, volume
 
 
 def gram(
@@ -180,23 +213,35 @@ def gram(
     moved: tuple[FloatArray, FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """As `starcal_uq.likelihood.paths.Sums.gram`."""
-    p, k = len(theta), frames.n_frames
-    q, at = (p + 1) * (p + 2) // 2, GramRows.of(model_name, p)
-    # Groups of three fill up the last one.
-    total, acc, slope = np.zeros((q + 2, q + 2)), np.zeros((3, q + 4 - p)), np.zeros(p)
-    _eliminated(
-        VERSION,
-        (
-            root_of(model_name, "forward"),
-            star_function("bent", model_name),
-            star_function("expand", model_name),
-        ),
-        (given(theta), given(whitening.ravel())),
-        weighted(frames, rotations),
-        given(frame_rows(whitening, moved)),
-        (_GRAM_CHUNK, at.attitude, at.columns, q, p + 1, 2 * p, at.slope),
-        (rows(WORK), rows(at.common), rows(at.own)),
-        (total, acc, np.empty(6), slope),
-        (np.empty((2, 0)), np.empty((3, 0, k)), np.empty((6, k)), np.empty(k)),
-    )
-    return symmetric(total[:q, :q]), slope
+    p, at = len(theta), GramRows.of(model_name, len(theta))
+    return _sums(
+        frames,
+        model_name,
+        theta,
+        rotations,
+        ("bent", "expand"),
+        (whitening, frame_rows(whitening, moved)),
+        (_GRAM_CHUNK, at.attitude, at.columns, (p + 1) * (p + 2) // 2, p + 1, 2 * p, at.slope),
+        np.empty((3, 0, frames.n_frames)),
+    )[:2]
+
+
+def slope(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    moved: tuple[FloatArray, FloatArray, FloatArray],
+) -> FloatArray:
+    """As `starcal_uq.likelihood.paths.Sums.slope`."""
+    p = len(theta)
+    return _sums(
+        frames,
+        model_name,
+        theta,
+        rotations,
+        ("slope", "gather"),
+        (theta, frame_rows(np.eye(p), moved)),
+        (CHUNK, 0, 0, 0, 0, 2 * p, 2 * p + 8),
+        np.empty((3, 0, frames.n_frames)),
+    )[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -175,10 +176,15 @@ def _sums(
     return cost, symmetric(matrix[:p, :p]), *of_frames
 
 
-def attitudes(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray:
+def attitudes(
+    frames: StarFrames, model_name: str, theta: FloatArray, weights: FloatArray | None = None
+) -> FloatArray:
     """As `starcal_uq.likelihood.paths.Sums.attitudes`."""
     if int(frames.sizes.max()) > CHUNK:
-        return arrays.attitudes(frames, model_name, theta)
+        return arrays.attitudes(frames, model_name, theta, weights)
+    if weights is not None:
+        share = weights / frames.spread(frames.sum(weights) / frames.sizes)
+        frames = replace(frames, r=frames.r * share)
     unturned = np.broadcast_to(np.eye(3), (frames.n_frames, 3, 3))
     profiles = _sums(frames, model_name, theta, unturned, "direction", 0)[3]
     with np.errstate(all="ignore"):

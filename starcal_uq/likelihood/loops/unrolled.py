@@ -139,13 +139,13 @@ class Rows:
 
 
 class _Output:
-    """An output of a kernel, whose elements stand in rows from `first` on."""
+    """An output of a kernel, whose elements stand in every so many rows from `first` on."""
 
-    def __init__(self, rows: Rows, first: int) -> None:
-        self._rows, self._first = rows, first
+    def __init__(self, rows: Rows, first: int, step: int) -> None:
+        self._rows, self._first, self._step = rows, first, step
 
     def __setitem__(self, element: int, value: Number | float) -> None:
-        self._rows[self._first + element] = value
+        self._rows[self._first + self._step * element] = value
 
 
 class Stars:
@@ -168,17 +168,23 @@ class Stars:
             yield Rows(self._code, self._one, column), Rows(self._code, self._two, column)
 
     def kernel(
-        self, kernel: Kernel, p: int, reads: Sequence[Sequence[int]], writes: Sequence[int]
+        self,
+        kernel: Kernel,
+        p: int,
+        reads: Sequence[Sequence[int | float]],
+        writes: Sequence[int],
+        step: int = 1,
     ) -> None:
         """Write a kernel of a camera model at every star.
 
-        `reads` are the rows of the first buffer of its inputs after theta, `writes` the first row
-        of the second buffer of each output.
+        `reads` are the rows of the first buffer of its inputs after theta, or what these are,
+        `writes` the first row of the second buffer of each output, whose elements fill every
+        `step`-th row from there on.
         """
         theta = self.numbers(p)
         with self.each() as (given, taken):
-            inputs = [theta, *([given[row] for row in rows] for rows in reads)]
-            kernel.run(inputs, [_Output(taken, first) for first in writes])
+            rest = [[given[n] if isinstance(n, int) else n for n in rows] for rows in reads]
+            kernel.run([theta, *rest], [_Output(taken, first, step) for first in writes])
 
 
 _pointer_to: Any = types.CPointer
