@@ -144,7 +144,8 @@ def gram(
     theta: FloatArray,
     whitening: FloatArray,
     rotations: FloatArray,
-    moved: tuple[FloatArray, FloatArray, FloatArray],
+    response: FloatArray,
+    inverse: FloatArray,
     look: Callable[[slice, FloatArray], None] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """As `starcal_uq.likelihood.paths.Sums.gram`; `look` is shown which frames are in a block, and
@@ -156,7 +157,7 @@ def gram(
         forward_kernel(model_name, "bent"),
     )
     q = (p + 1) * (p + 2) // 2
-    total, slope, by_frame = np.zeros((q, q)), np.zeros(p), frame_rows(whitening, moved)
+    total, slope, by_frame = np.zeros((q, q)), np.zeros(p), frame_rows(whitening, response, inverse)
     for first, last in frames.parts(_EXPANSION_STARS):
         part = frames.part(first, last)
         b, n = part.rotated(rotations[first:last]), part.n_stars
@@ -176,7 +177,7 @@ def gram(
         total += flat @ flat.T
         slopes = products_by_frame(part, outputs[2], second)
         total[p + 1 :, p + 1 :] -= np.einsum(
-            "kiq,ijk,kjr->qr", slopes, moved[2][..., first:last], slopes, optimize=True
+            "kiq,ijk,kjr->qr", slopes, inverse[..., first:last], slopes, optimize=True
         )
         slope += [np.sum(block.own[at.slope + 2 * z]) for z in range(p)]
         if look is not None:
@@ -189,7 +190,8 @@ def slope(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    moved: tuple[FloatArray, FloatArray, FloatArray],
+    response: FloatArray,
+    inverse: FloatArray,
 ) -> FloatArray:
     """As `starcal_uq.likelihood.paths.Sums.slope`."""
     weight = np.linalg.inv(np.eye(2) if frames.axes is None else frames.axes).ravel()
@@ -198,11 +200,11 @@ def slope(
         part, own = frames.part(first, last), slice(first, last)
         b = part.rotated(rotations[own])
         root = forward_root(model_name, theta, b)
-        spread = part.spread(moved[2][..., own].reshape(9, -1))
+        spread = part.spread(inverse[..., own].reshape(9, -1))
         (found,) = kernel(part.n_stars, theta, b, root, part.pixel, weight, spread)
         if part.weight is not None:
             found *= part.weight**2
-        turned = np.einsum("ik,ipk->p", part.sum(found[-3:]), moved[1][..., own])
+        turned = np.einsum("ik,ipk->p", part.sum(found[-3:]), response[..., own])
         total += found[:-3].sum(axis=1) + turned
     return total
 

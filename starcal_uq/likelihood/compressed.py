@@ -152,8 +152,7 @@ def gram_sums(
     """
     theta, (sums, at) = np.asarray(theta, dtype=np.float64), known
     # A nanoradian that is left would move the estimate by some 1e-8 sigma.
-    moved = (np.zeros_like(at.shift), at.response, at.inverse)
-    given = (frames, model_name, theta, whitening, at.at(theta), moved)
+    given = (frames, model_name, theta, whitening, at.at(theta), at.response, at.inverse)
     with np.errstate(all="ignore"):
         gram, slope = sums_for(frames).gram(*given) if look is None else arrays.gram(*given, look)
     return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)

@@ -44,13 +44,12 @@ def added(terms: Sequence[Any]) -> Any:
 class GramRows:
     """First rows of the two buffers of the Gram matrix.
 
-    The first buffer holds of each star's frame the path (3, p), the shift (3) and the inverse (6),
-    and what one axis needs meanwhile. The second holds e, H, A and the second derivatives that do
+    The first buffer holds of each star's frame the path (3, p) and the inverse (6), and what one
+    axis needs meanwhile. The second holds e, H, A and the second derivatives that do
     not vanish, then the slopes and the columns, two axes each; and two columns of zeros, which fill
     up a group of three.
     """
 
-    shift: int
     inverse: int
     turned: int
     pseudo: int
@@ -67,11 +66,10 @@ class GramRows:
         slope = attitude + 6 + 2 * len(bent_index(model)[0])
         columns = slope + 2 * p
         return cls(
-            shift=3 * p,
-            inverse=3 * p + 3,
-            turned=3 * p + 9,
-            pseudo=6 * p + 9,
-            common=6 * p + 12,
+            inverse=3 * p,
+            turned=3 * p + 6,
+            pseudo=6 * p + 6,
+            common=6 * p + 9,
             attitude=attitude,
             bent=attitude + 6,
             slope=slope,
@@ -80,14 +78,10 @@ class GramRows:
         )
 
 
-def frame_rows(
-    whitening: FloatArray, moved: tuple[FloatArray, FloatArray, FloatArray]
-) -> FloatArray:
-    """Rows of the first buffer that stars of a frame share, (3 p + 9, K), from shift, response and
-    inverse of the frames.
-    """
-    path = np.einsum("ipk,pa->iak", moved[1], whitening)
-    return np.concatenate([path.reshape(-1, path.shape[2]), moved[0], moved[2][np.triu_indices(3)]])
+def frame_rows(whitening: FloatArray, response: FloatArray, inverse: FloatArray) -> FloatArray:
+    """Rows of the first buffer that stars of a frame share, (3 p + 6, K)."""
+    path = np.einsum("ipk,pa->iak", response, whitening)
+    return np.concatenate([path.reshape(-1, path.shape[2]), inverse[np.triu_indices(3)]])
 
 
 def packed(i: int, j: int) -> int:
@@ -111,7 +105,7 @@ def expand(stars: Stars, model: str, p: int) -> None:
     with stars.each() as (common, own):
         a = [own[at.attitude + 2 * c] for c in range(3)]
         h = [own[2 + 2 * t] for t in range(p)]
-        own[at.columns] = own[0] - added([common[at.shift + c] * a[c] for c in range(3)])
+        own[at.columns] = own[0]
         for c in range(3):
             common[at.pseudo + c] = added(
                 [common[at.inverse + packed(c, d)] * a[d] for d in range(3)]
@@ -128,25 +122,17 @@ def expand(stars: Stars, model: str, p: int) -> None:
         column += 2 * (p - z)
 
 
-def follow(stars: Stars, model: str, p: int) -> None:
-    """H' from H and A: the numbers are the turn C (3, p) of all frames together."""
-    turn = stars.numbers(3 * p)
-    with stars.each() as (_, own):
+def follow(stars: Stars, model: str, p: int, by_frame: bool = False) -> None:
+    """H where the attitudes follow theta, from H and A: the numbers are the turn (3, p) of all
+    frames together, or, `by_frame`, the first buffer begins with that of the star's frame.
+    """
+    shared = stars.numbers(3 * p)
+    with stars.each() as (common, own):
+        turn = common if by_frame else shared
         a = [own[2 + 2 * p + 2 * c] for c in range(3)]
         for t in range(p):
             turned = added([turn[c * p + t] * a[c] for c in range(3)])
-            own[2 + 2 * t] = own[2 + 2 * t] - turned
-
-
-def gather(stars: Stars, model: str, p: int) -> None:
-    """Slopes along theta, the attitudes following, from those over (theta, phi); the first buffer
-    begins as that of the Gram matrix, without whitening.
-    """
-    with stars.each() as (common, own):
-        turns = [own[2 + 2 * (p + c)] for c in range(3)]
-        for t in range(p):
-            turned = [common[p * c + t] * turns[c] for c in range(3)]
-            own[2 * (p + 4 + t)] = added([own[2 + 2 * t], *turned])
+            own[2 + 2 * t] = own[2 + 2 * t] + turned
 
 
 def _turn(stars: Stars, at: GramRows, whitening: list[Any], z: int, entries: Entries) -> None:

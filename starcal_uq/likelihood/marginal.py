@@ -315,9 +315,10 @@ class MarginalLikelihood:
         """Slope (p,) of minus the log likelihood at theta (p,), times ``sigma**2``; attitudes follow
         from `near`.
         """
-        moved = near.shift, near.response, sigma**2 * near.inverse
-        frames, model_name = self.frames, self.model_name
-        return sums_for(frames).slope(frames, model_name, theta, near.at(theta), moved)
+        inverse = sigma**2 * near.inverse
+        return sums_for(self.frames).slope(
+            self.frames, self.model_name, theta, near.at(theta), near.response, inverse
+        )
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable

@@ -103,13 +103,15 @@ class Sums(Protocol):
         theta: FloatArray,
         whitening: FloatArray,
         rotations: FloatArray,
-        moved: tuple[FloatArray, FloatArray, FloatArray],
+        response: FloatArray,
+        inverse: FloatArray,
         /,
     ) -> tuple[FloatArray, FloatArray]:
         """Gram matrix (q, q) of `starcal_uq.likelihood.compressed.GramSums`, and the slope (p,) of
         the log determinant.
 
-        `moved` are shift, response and inverse of the frames at `rotations`.
+        `response` (3, p, K) and `inverse` (3, 3, K) are those of the frames, whose best attitudes
+        are `rotations`.
         """
 
     def slope(
@@ -118,12 +120,13 @@ class Sums(Protocol):
         model_name: str,
         theta: FloatArray,
         rotations: FloatArray,
-        moved: tuple[FloatArray, FloatArray, FloatArray],
+        response: FloatArray,
+        inverse: FloatArray,
         /,
     ) -> FloatArray:
         """Slope (p,) of ``(e^T e + sigma**2 log |A^T A|) / 2`` along theta, attitudes following.
 
-        `moved` as for `gram`, the inverse times ``sigma**2``.
+        The inverse is that of `gram` times ``sigma**2``.
         """
 
     def pairs(

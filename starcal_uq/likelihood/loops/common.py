@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +22,7 @@ from starcal_uq.camera.projection import (
     slope_kernel,
 )
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.expansion import expand, follow, gather, packed
+from starcal_uq.likelihood.expansion import expand, follow, packed
 from starcal_uq.likelihood.loops.unrolled import STAR_FUNCTION, STRIDE, Code, Stars, call
 from starcal_uq.observations.frames import StarFrames
 
@@ -68,7 +68,11 @@ def compiled(entry: bool = False) -> Callable[[F], F]:
 
 
 # Functions of a chunk of stars that are no kernels of the model.
-_COLUMNS = {"expand": expand, "follow": follow, "gather": gather}
+_COLUMNS: dict[str, Callable[..., None]] = {
+    "expand": expand,
+    "follow": follow,
+    "gather": partial(follow, by_frame=True),
+}
 
 
 def _kernel(what: str, model: str) -> Kernel:
@@ -96,8 +100,9 @@ def _star_code(typingctx: Any, key: Any, numbers: Any, one: Any, two: Any, m: An
         elif what == "root":
             reads, writes = [(6, 7), (3, 4)], (0, 2)
         elif what == "slope":
-            # Stars are weighted afterwards. One number takes the place of two axes.
-            inverse = [WORK + 3 * p + 3 + packed(i, j) for i in range(3) for j in range(3)]
+            # Stars are weighted afterwards. One number takes the place of two axes, and stands
+            # where H and A do.
+            inverse = [WORK + 3 * p + packed(i, j) for i in range(3) for j in range(3)]
             reads += [(6, 7), (1.0, 0.0, 0.0, 1.0), inverse]
             writes, step = (2,), 2
         stars.kernel(kernel, p, reads, writes, step)

@@ -47,7 +47,8 @@ def _eliminated(
 
     The function `kernel` makes rows of a chunk, e first, and `change` makes others of them, axis by
     axis; both see `frame_rows` at every star. Columns are counted from row `columns` on; the first
-    `free` are known to be without what is eliminated, the columns from row `attitude` on.
+    `free` are known to be without what is eliminated, the columns from row `attitude` on. Sums over
+    all stars are taken of rows from `slopes` on. Stars weigh on the first `n_rows`.
     """
     columns_of_stars, weight, starts, rotations = stars
     x, y, r0, r1, r2 = columns_of_stars
@@ -55,7 +56,7 @@ def _eliminated(
     sky = (data(r0), data(r1), data(r2)), start, data(rotations)
     theta, shared = data(numbers[0]), data(numbers[1])
     root, kernel, change = functions
-    chunk, attitude, columns, n_columns, free, n_slopes, n_rows = at
+    chunk, attitude, columns, slopes, n_columns, free, n_slopes, n_rows = at
     work, own = data(buffers[0]), data(buffers[1])
     gram, acc, inverse, slope = sums
     residuals, solved, inverses, volume = of_frames
@@ -93,7 +94,7 @@ def _eliminated(
         for axis in range(2):
             call(change, shared, common, row(own, axis), m)
         for k in range(n_slopes):
-            of, total = row(own, n_rows + k), 0.0
+            of, total = row(own, slopes + k), 0.0
             for i in range(m):
                 total += of[i]
             slope[k // 2] += total
@@ -193,8 +194,8 @@ def normals(
         theta,
         rotations,
         ("first", "follow"),
-        (turn, np.empty((0, k))),
-        (CHUNK, 2 * p + 2, 0, p + 1, 0, 0, 2 * p + 8),
+        (-turn, np.empty((0, k))),
+        (CHUNK, 2 * p + 2, 0, 0, p + 1, 0, 0, 2 * p + 8),
         solved,
         residuals,
     )
@@ -210,18 +211,20 @@ def gram(
     theta: FloatArray,
     whitening: FloatArray,
     rotations: FloatArray,
-    moved: tuple[FloatArray, FloatArray, FloatArray],
+    response: FloatArray,
+    inverse: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """As `starcal_uq.likelihood.paths.Sums.gram`."""
     p, at = len(theta), GramRows.of(model_name, len(theta))
+    q = (p + 1) * (p + 2) // 2
     return _sums(
         frames,
         model_name,
         theta,
         rotations,
         ("bent", "expand"),
-        (whitening, frame_rows(whitening, moved)),
-        (_GRAM_CHUNK, at.attitude, at.columns, (p + 1) * (p + 2) // 2, p + 1, 2 * p, at.slope),
+        (whitening, frame_rows(whitening, response, inverse)),
+        (_GRAM_CHUNK, at.attitude, at.columns, at.slope, q, p + 1, 2 * p, at.slope),
         np.empty((3, 0, frames.n_frames)),
     )[:2]
 
@@ -231,7 +234,8 @@ def slope(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    moved: tuple[FloatArray, FloatArray, FloatArray],
+    response: FloatArray,
+    inverse: FloatArray,
 ) -> FloatArray:
     """As `starcal_uq.likelihood.paths.Sums.slope`."""
     p = len(theta)
@@ -241,7 +245,7 @@ def slope(
         theta,
         rotations,
         ("slope", "gather"),
-        (theta, frame_rows(np.eye(p), moved)),
-        (CHUNK, 0, 0, 0, 0, 2 * p, 2 * p + 8),
+        (np.eye(p), frame_rows(np.eye(p), response, inverse)),
+        (CHUNK, 0, 0, 2, 0, 0, 2 * p, 2 * p + 8),
         np.empty((3, 0, frames.n_frames)),
     )[1]
