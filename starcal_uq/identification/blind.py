@@ -115,14 +115,14 @@ def quads_of(neighbours: IntArray) -> IntArray:
     """
     three = _threes(neighbours.shape[1] - 1)
     own = np.repeat(neighbours[:, 0], len(three))[:, None]
-    quads = np.sort(np.hstack([own, neighbours[:, three].reshape(-1, 3)]), axis=1)
+    quads = np.sort(np.hstack([own, neighbours.take(three, axis=1).reshape(-1, 3)]), axis=1)
     # One key, or two, are sorted faster than rows of four: the last number of a key counts most.
     kind = "<u2" if quads.max(initial=0) < 1 << 16 else "<u4"
-    keys = quads[:, _IN_KEY].astype(kind, order="C").view("<u8")
+    keys = quads.take(_IN_KEY, axis=1).astype(kind).view("<u8")
     keys = np.sort(keys, axis=0) if keys.shape[1] == 1 else keys[np.lexsort(keys.T)]
     new = np.ones(len(keys), dtype=np.bool_)
     new[1:] = np.any(keys[1:] != keys[:-1], axis=1)
-    return keys[new].view(kind)[:, _IN_KEY].astype(np.int64)
+    return keys[new].view(kind).take(_IN_KEY, axis=1).astype(np.int64)
 
 
 # Of four points, the ends of each side and the other two.
@@ -142,7 +142,7 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     p = np.einsum("ikq,aiq->akq", v, axes_along(v, 0, 1))
     p = (p[0] + 1j * p[1]) / p[2]
     apart = p[_ENDS[0]] - p[_ENDS[1]]
-    order = _ENDS[:, np.argmax(apart.real**2 + apart.imag**2, axis=0)]
+    order = _ENDS.take(np.argmax(apart.real**2 + apart.imag**2, axis=0), axis=1)
     p = np.take_along_axis(p, order, axis=0)
     c = (p[2:] - p[0]) / (p[1] - p[0])
     turn = c.real.sum(axis=0) > 1.0
@@ -153,7 +153,8 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     order[2:] = np.where(swap, order[:1:-1], order[2:])
     quads = np.take_along_axis(quads, order.T, axis=1)
     codes = np.ascontiguousarray(c.T).view(np.float64)
-    return codes, quads, angle_between(directions[quads[:, 0]], directions[quads[:, 1]])
+    a, b = (directions.take(ends, axis=0) for ends in quads.T[:2])
+    return codes, quads, angle_between(a, b)
 
 
 # Codes are kept by cells of this width, so that what is like a code lies in one or two of them along
@@ -220,7 +221,7 @@ class Level:
         start = self.start[place].astype(np.int64)
         count = self.start[place + 1] - start
         mine, theirs = np.repeat(row, count), rows_of(start, count)
-        apart = self.codes[theirs] - codes[mine]
+        apart = self.codes.take(theirs, axis=0) - codes.take(mine, axis=0)
         near = np.einsum("ij,ij->i", apart, apart) < _CODE_TOLERANCE**2
         # Cells of one row that share a place show the same patterns.
         n = max(len(self.codes), 1)
@@ -246,7 +247,8 @@ def make_level(directions: FloatArray) -> Level:
     # A sort of numbers that end in their places takes half the time of a stable `argsort`.
     order = np.sort((place << 32) + np.arange(len(place))) & 0xFFFFFFFF
     start = np.append(0, np.cumsum(np.bincount(place, minlength=n))).astype(np.int32)
-    return Level(directions, quads[order].astype(np.int32), size[order], codes[order], start)
+    points = quads.astype(np.int32).take(order, axis=0)
+    return Level(directions, points, size.take(order), codes.take(order, axis=0), start)
 
 
 # Levels of before: catalogues of any depth share those of the bright stars.
@@ -392,11 +394,9 @@ class BlindSearch:
         by chance.
         """
         m = min(len(u), _EXPLAINED)
-        b = unit_directions(u, focal)
-        rows = np.arange(len(mine))[:, None]
-        rotation = axes_of(b[rows, mine], 0, 1).transpose(0, 2, 1) @ axes_of(
-            level.directions[theirs], 0, 1
-        )
+        b, rows = unit_directions(u, focal), np.arange(len(mine))[:, None]
+        directions = level.directions.take(theirs, axis=0)
+        rotation = axes_of(b[rows, mine], 0, 1).transpose(0, 2, 1) @ axes_of(directions, 0, 1)
         sky = b[:, :m] @ rotation
         corner = u[mine]
         span = np.hypot(*(corner[:, 1] - corner[:, 0]).T)[:, None]
@@ -412,7 +412,7 @@ class BlindSearch:
         # The sum of the logarithms, less that of the choices among the stars that might have been
         # explained.
         log10_chance = np.where(near, np.log10(chance * m), 0.0).sum(axis=1)
-        return rotation, focal, log10_chance, mine, level.directions[theirs]
+        return rotation, focal, log10_chance, mine, directions
 
     def solve(
         self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]
