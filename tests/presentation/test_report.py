@@ -373,6 +373,36 @@ def test_figures_drawn_ahead_by_another_process_are_the_same(full):
     assert {path.stem for path in full.figures.iterdir()} <= set(FIGURES)
 
 
+def _until(path):
+    while not path.exists():
+        time.sleep(0.01)
+
+
+def test_this_process_draws_what_the_other_has_not_begun_while_it_waits(
+    full, monkeypatch, tmp_path
+):
+    monkeypatch.setattr("starcal_uq.core.tasks.processors", lambda: 2)
+    monkeypatch.setattr("starcal_uq.presentation.report.drawing._WORTH_LOADING", 1)
+    results, here = sc.Run(full.path).results, []
+    names = ("distortion_curve", "price_of_coupling")
+    drawn = draw_figures(results, names)
+
+    def draw(_, asked):
+        here.extend(asked)
+        if len(here) == 2:
+            (tmp_path / "end").touch()
+        return {name: drawn[name] for name in asked}
+
+    with Ahead() as ahead:
+        waits = ahead.begin(_until, tmp_path / "end")
+        ahead.draw(results, names)
+        monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", draw)
+        waits()
+        assert here == [*reversed(names)]
+        # Nothing is drawn twice.
+        assert (ahead.figures(), len(here)) == (drawn, 2)
+
+
 def test_another_process_that_fails_or_is_killed_is_no_obstacle(monkeypatch):
     monkeypatch.setattr("starcal_uq.core.tasks.processors", lambda: 2)
     with pytest.raises(ZeroDivisionError), Ahead() as ahead:
