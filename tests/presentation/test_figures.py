@@ -36,9 +36,21 @@ from starcal_uq.presentation.figures.inference import (
     plot_prior_posterior,
     sparse,
 )
-from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
+from starcal_uq.presentation.figures.propagation import (
+    plot_attitude,
+    plot_distortion_curve,
+    plot_field_map,
+)
 from starcal_uq.presentation.figures.scales import axis_scale, symbol
-from starcal_uq.presentation.figures.style import figure_of, new_figure, panels, png_bytes
+from starcal_uq.presentation.figures.style import (
+    figure_of,
+    new_axes,
+    new_figure,
+    painted,
+    panels,
+    png_bytes,
+)
+from starcal_uq.presentation.figures.ticks import single_ticks
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard_error import OnboardError
 from tests.helpers.scenes import camera, nominal, observations
@@ -271,6 +283,37 @@ def test_figures_are_repeatable_and_show_themselves(run):
     assert first == second
     both = plot_correlations(run.coupling)
     assert overlapping(both) == [] and both._repr_png_().startswith(PNG)
+
+
+def test_single_ticks_draw_the_same_picture(run, errors):
+    """Also beside a colour bar, secondary axes, minor ticks and an offset; afterwards nothing has
+    changed.
+    """
+
+    def far():
+        ax = new_axes(4.0, 3.0)
+        ax.plot([1e6, 1e6 + 1.0], [0.0, 1.0])
+        return ax
+
+    curve = sc.propagation.distortion_curve(run.post, run.obs, n=11, n_draws=50)
+    for make in (
+        lambda: plot_corner(run.post, run.cal, run.truth),
+        lambda: plot_convergence(run.cal, run.truth),
+        lambda: plot_correlations(run.coupling),
+        lambda: plot_distortion_curve(curve),
+        lambda: plot_field_map(errors[1]),
+        lambda: figure_of(plot_attitude(errors[0])),
+        lambda: figure_of(far()),
+    ):
+        figure, other = make(), make()
+        axes = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
+        before = [axis.get_visible() for axis in axes]
+        with single_ticks(figure):
+            assert sum(axis.get_visible() for axis in axes) < sum(before)
+            assert np.array_equal(painted(figure, 60), painted(other, 60))
+        assert [axis.get_visible() for axis in axes] == before
+        # The fit of panels depends on the one before.
+        assert np.array_equal(painted(figure, 60), painted(other, 60))
 
 
 def test_settings_of_the_user_stay_untouched(run):

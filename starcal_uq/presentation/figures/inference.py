@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -95,9 +95,9 @@ def _density(ax: Axes, x: FloatArray, y: FloatArray) -> None:
     mean = np.array([x.mean(), y.mean()])
     values, vectors = np.linalg.eigh(np.cov(x, y))
     axes = vectors * np.sqrt(np.maximum(values, 1e-300))
-    u, v = np.linalg.solve(axes, np.stack([x, y]) - mean[:, None])
-    reach = max(HALF_WIDTH_SD, float(np.quantile(np.abs(np.stack([u, v])), 0.9995)))
-    counts, _, _ = np.histogram2d(u, v, bins=BINS, range=[(-reach, reach)] * 2)
+    white = np.linalg.inv(axes) @ (np.stack([x, y]) - mean[:, None])
+    reach = max(HALF_WIDTH_SD, float(np.quantile(np.abs(white), 0.9995)))
+    counts, _, _ = np.histogram2d(white[0], white[1], bins=BINS, range=[(-reach, reach)] * 2)
     # Takes the counting noise off the contours and widens them by about 2 %.
     smooth = gaussian_filter(counts, 1.0, mode="constant", truncate=_BLUR)
     levels = mass_levels(smooth, CONTOUR_MASSES)
@@ -324,17 +324,17 @@ def histogram(
 
 def sparse(ax: Axes, *, y: bool) -> None:
     """A few ticks between the present limits, without offsets; no vertical axis unless `y`."""
-    ax.set_xticks(inner_ticks(*ax.get_xlim()))
-    if y:
-        ax.set_yticks(inner_ticks(*ax.get_ylim()))
-    else:
-        ax.set_yticks([])
-        ax.spines["left"].set_visible(False)
-    for axis in (ax.xaxis, ax.yaxis):
+    from matplotlib.ticker import FixedLocator
+
+    ax.spines["left"].set_visible(y)
+    for axis, shown in ((ax.xaxis, True), (ax.yaxis, y)):
+        axis.set_major_locator(
+            FixedLocator(inner_ticks(*axis.get_view_interval()) if shown else [])
+        )
         axis.get_major_formatter().set_useOffset(False)  # type: ignore[attr-defined]
 
 
-def inner_ticks(low: float, high: float) -> FloatArray:
+def inner_ticks(low: float, high: float) -> Any:
     """Round values, two to five, so far from both ends that their labels do not touch those of the
     next panel.
     """

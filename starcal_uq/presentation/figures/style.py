@@ -22,6 +22,7 @@ from starcal_uq.core.display import GIVEN
 from starcal_uq.core.formatting import MINUS, significant, superscript
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.ticks import single_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -178,11 +179,13 @@ def signed_log(
     """An axis from -`reach` to `reach`, linear within `linear`, with ticks at `most` powers of ten
     on either side of `inner` ones.
     """
+    from matplotlib.ticker import FixedLocator
+
     ax = axis.axes
     log_scale(axis, linear, **options)
     powers = 10.0 ** np.arange(1, np.floor(np.log10(reach)) + 1)
     powers = powers[:: -max(1, -(-len(powers) // most))]
-    axis.set_ticks([*-powers, *inner, *powers])
+    axis.set_major_locator(FixedLocator([*-powers, *inner, *powers]))
     (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(-reach, reach)
 
 
@@ -442,12 +445,14 @@ _SHORTER = tuple(
         (r"<\?xml[^>]*>|<!DOCTYPE[^>]*>|<!--.*?-->|<metadata>.*?</metadata>", ""),
         # Not of numbers below one, which are scales.
         (r"(?<=\.\d\d)(?<![ (-]0\.\d\d)\d+", ""),
-        (r"\s*\n\s*", " "),
+        (r" \n", "\n"),
+        (r"\n\s*", " "),
         (r"<g id=\"[^\"]*\"", "<g"),
         (r"<g ?/>", ""),
         (r"DejaVuSans-", "g"),
         (r" transform=\"translate\(([-\d.]+) 0\)\"/>", r' x="\1"/>'),
-        (r"(?<=>) | (?=/?>)", ""),
+        (r"> ", ">"),
+        (r" (?=/?>)", ""),
     )
 )
 
@@ -462,7 +467,10 @@ def svg_bytes(figure: Figure) -> bytes:
     canvas, resolution, buffer = figure.canvas, figure.dpi, io.StringIO()
     try:
         figure.dpi = DPI
-        with rc_context({"svg.hashsalt": "starcal_uq", "svg.fonttype": "path"}):
+        with (
+            rc_context({"svg.hashsalt": "starcal_uq", "svg.fonttype": "path"}),
+            single_ticks(figure),
+        ):
             metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
             svg: Any = FigureCanvasSVG(figure)
             svg.print_svg(buffer, metadata=metadata)
