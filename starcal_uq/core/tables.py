@@ -69,11 +69,15 @@ def read_cells(
     if ending != ".parquet":
         return _read_text(path, data, ecsv=ending == ".ecsv")
     import pyarrow as pa
+    from pyarrow.parquet import ParquetFile
 
     with opened(path, data) as file:
         names = list(file.schema_arrow.names)
         own = [name for name in names if wanted is None or name in wanted]
-        table = file.read(columns=own, use_threads=False)
+        # Texts are codes in the file, and stay so.
+        texts = [name for name in own if file.schema_arrow.field(name).type == pa.string()]
+        with ParquetFile(pa.BufferReader(data), read_dictionary=texts, pre_buffer=False) as again:
+            table = again.read(columns=own, use_threads=False)
         meta = own_meta(file.schema_arrow, key)
     rows = np.arange(table.num_rows)
     if chosen is not None:
@@ -104,23 +108,18 @@ def write_parquet(
     import pyarrow as pa
     from pyarrow import parquet
 
-    table = pa.table({name: _of_arrow(values) for name, values in columns.items()})
+    table = pa.table(
+        {
+            name: pa.DictionaryArray.from_arrays(
+                values.codes, values.names.tolist()
+            ).dictionary_decode()
+            if isinstance(values, Texts)
+            else values
+            for name, values in columns.items()
+        }
+    )
     options = {"compression": "zstd", **options}
     parquet.write_table(table.replace_schema_metadata({key: meta}), path, **options)
-
-
-def coded(texts: Texts) -> Any:
-    """Texts as an array of arrow that holds their codes."""
-    import pyarrow as pa
-
-    return pa.DictionaryArray.from_arrays(texts.codes, texts.names.tolist())
-
-
-def _of_arrow(values: Any) -> Any:
-    if isinstance(values, Texts):
-        return coded(values).dictionary_decode()
-    is_text = isinstance(values, np.ndarray) and values.dtype.kind == "U"
-    return values.tolist() if is_text else values
 
 
 def own_meta(schema: pa.Schema, key: bytes = META_KEY) -> AnyDict:
@@ -133,7 +132,7 @@ def own_meta(schema: pa.Schema, key: bytes = META_KEY) -> AnyDict:
 
 
 def arrow_columns(table: pa.Table) -> AnyDict:
-    """Columns of an arrow table: arrays if they hold numbers without nulls, else texts."""
+    """Columns of an arrow table: arrays if they hold numbers without nulls, else `Texts`."""
     return {name: _arrow_values(table.column(name)) for name in table.column_names}
 
 
@@ -142,19 +141,20 @@ def _arrow_values(column: Any) -> Any:
     import pyarrow as pa
 
     kind = column.type
-    if not column.null_count and (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)):
-        return column.to_numpy()
+    if pa.types.is_nested(kind):
+        return ["" if value is None else str(value) for value in column.to_pylist()]
+    if not column.null_count and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        # Arrow's own `to_numpy` would load pandas.
+        return np.from_dlpack(column.combine_chunks())
     if pa.types.is_timestamp(kind):
-        texts = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
-        return ["" if text == "NaT" else text for text in texts.tolist()]
-    if any(
-        is_it(kind)
-        for is_it in (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
-    ):
-        coded = column.dictionary_encode().unify_dictionaries().combine_chunks()
-        texts = ["" if value is None else str(value) for value in coded.dictionary.to_pylist()]
-        return Texts.placed(coded.indices.fill_null(len(texts)), [*texts, ""])
-    return ["" if value is None else str(value) for value in column.to_pylist()]
+        column = column.cast(pa.timestamp("ns")).cast(pa.string())
+    if column.null_count and pa.types.is_dictionary(kind):
+        column = column.cast(kind.value_type)
+    coded = column.combine_chunks()
+    if not pa.types.is_dictionary(coded.type):
+        coded = coded.dictionary_encode("encode")
+    texts = ["" if value is None else str(value) for value in coded.dictionary.to_pylist()]
+    return Texts.placed(np.from_dlpack(coded.indices), texts)
 
 
 def delimiter_of(lines: Iterable[str]) -> str:

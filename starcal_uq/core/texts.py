@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
@@ -11,14 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcal_uq.core.types import StrArray
 
-if TYPE_CHECKING:
-    # It is used as an array of texts, and becomes one wherever NumPy wants an array.
-    _Base = np.ndarray[tuple[int], np.dtype[np.str_]]
-else:
-    _Base = NDArrayOperatorsMixin
+# Whoever takes an array of texts takes these as well.
+_ARRAY: Any = NDArrayOperatorsMixin
 
 
-class Texts(_Base):
+class Texts(_ARRAY):  # type: ignore[misc]
     """Texts (N,) as whole numbers, the places of a few different ones: a view that is used as an
     array of texts.
 
@@ -37,15 +34,11 @@ class Texts(_Base):
     names: StrArray
     ndim = 1
 
-    if TYPE_CHECKING:
-
-        def __new__(cls, codes: NDArray[np.int32], names: StrArray) -> Texts: ...
-
     def __init__(self, codes: NDArray[np.int32], names: StrArray) -> None:
         for values in (codes, names):
             values.setflags(write=False)
         self.codes, self.names = codes, names
-        self.shape = codes.shape
+        self.dtype, self.shape = names.dtype, codes.shape
 
     @classmethod
     def of(cls, values: Any) -> Texts:
@@ -57,7 +50,7 @@ class Texts(_Base):
             # pandas marks a missing text by None or NaN, which would become words.
             cells = ["" if v is None or v != v else str(v) for v in array.tolist()]
         else:
-            cells = array.astype(np.str_).tolist()
+            cells = array.astype(np.str_, copy=False).tolist()
         places = {text: place for place, text in enumerate(dict.fromkeys(cells))}
         return cls.placed(np.fromiter(map(places.__getitem__, cells), np.int64), list(places))
 
@@ -72,12 +65,16 @@ class Texts(_Base):
         return cls(codes[place], names)
 
     @classmethod
-    def joined(cls, parts: Sequence[ArrayLike]) -> Texts:
+    def unknown(cls, n: int) -> Texts:
+        """A column of n empty texts."""
+        return cls.placed(np.zeros(n), [""])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Texts]) -> Texts:
         """Several columns, one after the other."""
-        columns = [cls.of(part) for part in parts]
-        starts = np.cumsum([0, *(len(column.names) for column in columns)])
-        places = [column.codes + start for column, start in zip(columns, starts, strict=False)]
-        return cls.placed(np.concatenate(places), np.concatenate([c.names for c in columns]))
+        names = np.unique(np.concatenate([part.names for part in parts]))
+        places = [np.searchsorted(names, part.names)[part.codes] for part in parts]
+        return cls.placed(np.concatenate(places), names)
 
     def map(self, function: Callable[[str], str]) -> Texts:
         """The column with each text replaced by what a function makes of it."""
@@ -86,11 +83,6 @@ class Texts(_Base):
     def tolist(self) -> list[str]:
         """The texts; equal ones are one object."""
         return self.names.astype(object)[self.codes].tolist()  # type: ignore[no-any-return]
-
-    @property
-    def dtype(self) -> np.dtype[np.str_]:
-        """Type of the texts as an array."""
-        return self.names.dtype
 
     def setflags(self, **flags: Any) -> None:
         """Nothing to do: it cannot be written to."""
@@ -109,12 +101,12 @@ class Texts(_Base):
         return np.asarray(self.names[self.codes], dtype=dtype)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        if method == "__call__" and all(one is self or np.ndim(one) == 0 for one in inputs):
+        others = [one for one in inputs if one is not self]
+        if method == "__call__" and not any(map(np.ndim, others)):
             # What is true of a text is true wherever it stands.
-            found = ufunc(*(self.names if one is self else one for one in inputs), **kwargs)
-            return found[self.codes]
-        plain = (np.asarray(one) if isinstance(one, Texts) else one for one in inputs)
-        return getattr(ufunc, method)(*plain, **kwargs)
+            inputs = tuple(self.names if one is self else one for one in inputs)
+            return ufunc(*inputs, **kwargs)[self.codes]
+        return getattr(ufunc, method)(*map(np.asarray, inputs), **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         # NumPy looks for special names, which must not be those of a copy that is gone.

@@ -92,7 +92,7 @@ def identification(
         )
         for k, f in enumerate(results)
     )
-    times = np.repeat([table.time_utc[k] for k, _ in solved], sizes)
+    times = [str(table.time_utc[k]) for k, _ in solved]
     origin = Origin.identified(
         stars.source,
         directions="apparent" if stars.apparent else "catalogue",
@@ -105,7 +105,7 @@ def identification(
         y_px=xy[:, 1],
         sigma_px=sigma,
         **stars.named(star),
-        time_utc=times.astype(str) if len(times) and all(times) else None,
+        time_utc=np.repeat(times, sizes) if times and all(times) else None,
         meta={**origin.plain(), "parity": parity},
     )
     # Not every table says which frames were left out.

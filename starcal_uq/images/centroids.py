@@ -304,6 +304,6 @@ _MARK = f"# {_KEY} "
 
 def _typed(cells: Any, kind: type) -> Any:
     """A column of texts in its type."""
-    if kind is np.bool_ and isinstance(cells, list):
+    if kind is np.bool_ and not isinstance(cells, np.ndarray):
         return [_TRUTH[cell] for cell in cells]
     return cells if isinstance(cells, np.ndarray) else np.array(cells, str).astype(kind)

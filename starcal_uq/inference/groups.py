@@ -323,7 +323,7 @@ class _Images:
             "star_frame": ("star", obs.frame),
         }
         if obs.star_id is not None:
-            self._coords["star_id"] = ("star", np.asarray(obs.star_id, dtype=str))
+            self._coords["star_id"] = ("star", np.asarray(obs.star_id))
 
     def _dataset(self, pixels: FloatArray, dims: tuple[str, ...], coords: AnyDict) -> xr.Dataset:
         """Positions (..., 2, n) and their residuals."""

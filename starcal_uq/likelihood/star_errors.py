@@ -13,7 +13,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.terms import Term
@@ -46,14 +45,13 @@ def star_numbers(obs: Observations, focal_px: float) -> IntArray:
 
 
 def _numbered(obs: Observations, focal_px: float) -> IntArray:
-    names = None if obs.star_id is None else Texts.of(obs.star_id)
-    named = names is not None and bool(np.all(names != ""))
+    named = bool(np.all(obs.named != ""))
     tolerance = max(_SAME_NAME_PX / focal_px, _SAME_NAME_RAD) if named else _SAME_PX / focal_px
     place = _linked(obs.directions_icrs, tolerance)
-    if not named or names is None:
+    if not named:
         return place
     # A name alone is not trusted: numbers that start again with every frame are no names of stars.
-    code = names.codes.astype(np.int64) * (int(place.max()) + 1) + place
+    code = obs.named.codes.astype(np.int64) * (int(place.max()) + 1) + place
     # Places among the few stars are found sooner than all images are sorted.
     return np.searchsorted(np.unique(code), code)
 
@@ -151,7 +149,7 @@ class StarModel:
 
     def __init__(self, obs: Observations, focal_px: float) -> None:
         self.numbers = star_numbers(obs, focal_px)
-        self.directions = np.ascontiguousarray(obs.directions_icrs.T)
+        self.directions = obs.direction_rows
         self.focal_px = focal_px
         self.images = np.bincount(self.numbers)
         self.stated2 = np.zeros(len(self.images))

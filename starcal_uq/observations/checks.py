@@ -172,12 +172,12 @@ def check_columns(
         else _unit_remedy(np.abs(dec) > 90.0)
     )
     problems += _each("dec_deg", dec, np.abs(dec) > 90.0, "is outside -90..90 deg", remedy)
-    if "sigma_px" in columns:
-        sigma = columns["sigma_px"]
-        problems += _each("sigma_px", sigma, sigma <= 0.0, "is not above 0")
-    if "direction_mas" in columns:
-        stated = columns["direction_mas"]
-        problems += _each("direction_mas", stated, stated < 0.0, "is below 0")
+    for name, wrongly, reason in (
+        ("sigma_px", np.less_equal, "is not above 0"),
+        ("direction_mas", np.less, "is below 0"),
+    ):
+        if name in columns:
+            problems += _each(name, columns[name], wrongly(columns[name], 0.0), reason)
     if camera is not None:
         problems += _in_millimetres(columns, camera)
         for name, size in (("x_px", camera.width_px), ("y_px", camera.height_px)):
@@ -247,18 +247,17 @@ def _check_counts(frame: IntArray) -> list[Problem]:
 def _check_repeats(columns: AnyMapping, rows: IntArray) -> list[Problem]:
     """Stars that a frame holds twice, by name, direction or place, among `rows`."""
     frame = columns["frame"]
-    searches: list[tuple[str, str, Any, tuple[Any, ...]]] = [
-        ("ra_deg", "the same direction", rows, (columns["ra_deg"], columns["dec_deg"])),
-        ("x_px", "the same pixel position", rows, (columns["x_px"], columns["y_px"])),
-    ]
-    if "star_id" in columns:
-        # A star without a name repeats none.
-        names = Texts.of(columns["star_id"])
-        named = rows[(names != "")[rows]]
-        searches.insert(0, ("star_id", "the same star", named, (names.codes,)))
+    names = columns.get("star_id", Texts.unknown(len(frame)))
+    # A star without a name repeats none.
+    named = rows[names[rows] != ""]
+    searches = (
+        ("star_id", "the same star", named, [names.codes]),
+        ("ra_deg", "the same direction", rows, [columns["ra_deg"], columns["dec_deg"]]),
+        ("x_px", "the same pixel position", rows, [columns["x_px"], columns["y_px"]]),
+    )
     repeats: dict[int, Problem] = {}
     for name, what, among, keys in searches:
-        for late, early in _repeats(frame[among], *(key[among] for key in keys)):
+        for late, early in repeated_rows(frame[among], *(key[among] for key in keys)):
             row, other = int(among[late]), int(among[early])
             # A row pasted twice agrees in everything; one reason is enough.
             reason = f"{what} occurs twice in frame {frame[row]}"
@@ -266,7 +265,7 @@ def _check_repeats(columns: AnyMapping, rows: IntArray) -> list[Problem]:
     return list(repeats.values())
 
 
-def _repeats(*keys: Any) -> list[tuple[int, int]]:
+def repeated_rows(*keys: Any) -> list[tuple[int, int]]:
     """(row, earlier row) for each row that agrees with an earlier one in all keys."""
     hashed = np.sort(row_hashes(*keys))
     if not np.any(hashed[1:] == hashed[:-1]):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 
@@ -16,32 +18,14 @@ class Column:
     """
 
     name: str
-    kind: Literal["whole", "number", "text", "time"]
-    unit: str
-    required: bool
-    gaps: bool
     description: str
+    kind: Literal["whole", "number", "text", "time"] = "number"
+    unit: str = ""
+    required: bool = False
+    gaps: bool = False
 
 
-COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column("frame", "whole", "", True, False, "frame number"),
-        Column(
-            "x_px", "number", "pix", True, False, "centroid; 0 is the centre of the first pixel"
-        ),
-        Column("y_px", "number", "pix", True, False, "centroid, y downwards; 0 as for x_px"),
-        Column("ra_deg", "number", "deg", True, False, "right ascension, ICRS axes"),
-        Column("dec_deg", "number", "deg", True, False, "declination, ICRS axes"),
-        Column("sigma_px", "number", "pix", False, False, "centroid noise per axis"),
-        Column("star_id", "text", "", False, True, "name of the star in its catalogue"),
-        Column("mag", "number", "mag", False, True, "magnitude"),
-        Column(
-            "direction_mas", "number", "mas", False, True, "stated error of the direction per axis"
-        ),
-        Column("time_utc", "time", "", False, False, "middle of the exposure, UTC, ISO 8601"),
-        Column(
-            "temperature_c", "number", "deg_C", False, True, "temperature of the optics, Celsius"
-        ),
-    )
+COLUMNS = {
+    name: Column(name, **entry)
+    for name, entry in tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8")).items()
 }

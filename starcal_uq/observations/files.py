@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,16 @@ from starcal_uq.core.files import (
     shown,
     table_ending,
 )
-from starcal_uq.core.tables import REMEDY, WHAT, RawTable, in_unit, opened, own_meta, read_cells
+from starcal_uq.core.tables import (
+    REMEDY,
+    WHAT,
+    RawTable,
+    arrow_columns,
+    in_unit,
+    opened,
+    own_meta,
+    read_cells,
+)
 from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import (
     AnyDict,
@@ -154,7 +163,7 @@ def column_behind(text: str, names: Sequence[str]) -> str:
 def _number_frames(raw: RawTable, own: str) -> None:
     """Number frames that have names, such as those of images, as they come."""
     cells = raw.columns.get(own)
-    if cells is None or (isinstance(cells, np.ndarray) and cells.dtype.kind != "U"):
+    if not isinstance(cells, list | Texts):
         return
     texts = Texts.of(cells)
     if not any(re.match(r"\s*([-+.]?\d[\d.e+-]*)?\s*$", cell) for cell in texts.names):
@@ -220,51 +229,41 @@ def convert_columns(
 ) -> tuple[AnyDict, list[Problem], BoolArray]:
     """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
     columns: AnyDict = {}
-    converted: dict[str, tuple[float, float]] = {}
     problems = [Problem(row, None, why) for row, why in raw.uneven.items()]
     unknown_frame = np.zeros(len(raw.numbers), dtype=np.bool_)
     for name, own in names.items():
         own, factor, shift = _linear(own, raw.names)
-        cells = raw.columns.get(own)
+        cells: Any = raw.columns.get(own)
         if cells is None:
             continue
-        kind = COLUMNS[name].kind
-        if (factor, shift) != (1.0, 0.0):
-            if kind != "number":
-                raise ObservationError(
-                    f"{path}: column {name} holds no quantities; give the name of a column alone."
-                )
-            converted[name] = factor, shift
-        # Whoever states a factor has left the unit of the file behind.
-        unit = raw.units.get(own, "") if factor == 1.0 else ""
-        if isinstance(cells, np.ndarray):
-            if kind == "number":
-                columns[name] = _to_unit(path, name, cells, unit)
-                continue
-            if kind == "whole" and cells.dtype.kind in "iu":
-                columns[name] = cells
-                continue
-            cells = [str(value) for value in cells.tolist()]
-        if not COLUMNS[name].required and not any(map(str.strip, cells)):
+        kind, as_it_is = COLUMNS[name].kind, (factor, shift) == (1.0, 0.0)
+        if kind != "number" and not as_it_is:
+            raise ObservationError(
+                f"{path}: column {name} holds no quantities; give the name of a column alone."
+            )
+        typed = isinstance(cells, np.ndarray)
+        if not (typed or COLUMNS[name].required or any(map(str.strip, cells))):
             continue  # an optional column without a single value is as good as absent
         bad: list[Problem] = []
-        if kind == "whole":
-            columns[name], bad = parse_whole(name, cells)
-            unknown_frame[[p.row for p in bad]] = True
-        elif kind == "number":
+        if kind == "number":
             if raw.decimal_comma:
                 cells = [cell.replace(",", ".") for cell in cells]
-            values, bad = parse_numbers(name, cells)
-            columns[name] = _to_unit(path, name, values, unit)
+            values, bad = (cells, bad) if typed else parse_numbers(name, cells)
+            # Whoever states a factor has left the unit of the file behind.
+            unit = raw.units.get(own, "") if factor == 1.0 else ""
+            values = _to_unit(path, name, values, unit)
+            columns[name] = values if as_it_is else values * factor + shift
+        elif kind == "whole" and typed and cells.dtype.kind in "iu":
+            columns[name] = cells
+        elif kind == "whole":
+            columns[name], bad = parse_whole(name, list(map(str, cells)))
+            unknown_frame[[p.row for p in bad]] = True
         elif kind == "time":
             columns[name], bad = parse_times(name, cells)
         else:
             texts = Texts.of(cells).map(str.strip)
             columns[name] = texts.map(cell_content) if raw.spreadsheet else texts
         problems += bad
-    for name in converted.keys() & columns.keys():
-        factor, shift = converted[name]
-        columns[name] = columns[name] * factor + shift
     return columns, problems, unknown_frame
 
 
@@ -343,7 +342,8 @@ def parquet_summary(path: Path, column: str) -> ParquetSummary:
 def parquet_column(path: Path, column: str) -> IntArray:
     """One column of whole numbers of a Parquet file, (N,)."""
     with opened(path) as file:
-        values = file.read(columns=[column], use_threads=False).column(column).to_numpy()
+        table = file.read(columns=[column], use_threads=False)
+        values = np.asarray(arrow_columns(table)[column])
     if values.dtype.kind not in "iu":
         raise ObservationError(
             f"{path}: column {column} holds no whole numbers; write it again.", column=column

@@ -55,8 +55,8 @@ class StarFrames:
     def from_observations(cls, obs: Observations) -> StarFrames:
         """Take the arrays that estimators need."""
         return cls(
-            pixel=np.ascontiguousarray(obs.xy.T),
-            r=np.ascontiguousarray(obs.directions_icrs.T),
+            pixel=np.stack([obs.x_px, obs.y_px]),
+            r=obs.direction_rows,
             weight=None if obs.sigma_px is None else 1.0 / obs.sigma_px,
             starts=obs.frame_starts,
             axes=obs.noise_axes,

@@ -35,8 +35,6 @@ from starcal_uq.observations.written import astropy_table, write_table
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
-# Rows of a column that are hashed at once.
-_ROWS_AT_ONCE = 100_000
 _DTYPES: dict[str, type] = {
     "whole": np.int64,
     "number": np.float64,
@@ -119,7 +117,8 @@ class Observations(FrameRows, Sourced, Shown):
         for name, values in columns.items():
             # A column without a single value is as good as absent, and files do not tell the two
             # apart.
-            absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
+            gap = values == "" if isinstance(values, Texts) else np.isnan(values)
+            absent = COLUMNS[name].gaps and n > 0 and bool(np.all(gap))
             object.__setattr__(self, name, None if absent else locked(values))
         object.__setattr__(self, "meta", {**self.meta, "directions": self.origin.directions})
 
@@ -142,12 +141,22 @@ class Observations(FrameRows, Sourced, Shown):
     @cached_property
     def directions_icrs(self) -> FloatArray:
         """Unit vectors of the directions, shape (N, 3), ICRS axes."""
-        return locked(unit_vectors(self.ra_deg, self.dec_deg))
+        return locked(np.ascontiguousarray(self.direction_rows.T))
+
+    @cached_property
+    def direction_rows(self) -> FloatArray:
+        """Unit vectors of the directions with the star axis last, shape (3, N), ICRS axes."""
+        return locked(np.ascontiguousarray(unit_vectors(self.ra_deg, self.dec_deg).T))
 
     @property
     def sigma_or_one(self) -> FloatArray:
         """Noise that the stars state, shape (N,), px per axis; one where they state none."""
         return np.ones(self.n_stars) if self.sigma_px is None else self.sigma_px
+
+    @property
+    def named(self) -> Texts:
+        """Names of the stars, shape (N,), by their codes; empty where unknown."""
+        return Texts.unknown(len(self)) if self.star_id is None else Texts.of(self.star_id)
 
     @cached_property
     def timed(self) -> bool:
@@ -166,15 +175,11 @@ class Observations(FrameRows, Sourced, Shown):
             digest.update(f"{name}:{len(values)};".encode())
             if isinstance(values, Texts):
                 # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
-                values = values.map(lambda text: f"{len(text)}:{text}")
-            for first in range(0, len(values), _ROWS_AT_ONCE):
-                part = values[first : first + _ROWS_AT_ONCE]
-                if isinstance(part, Texts):
-                    digest.update("".join(part).encode())
-                else:
-                    # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
-                    part = part + values.dtype.type(0)
-                    digest.update(part.astype(values.dtype.newbyteorder("<"), copy=False))
+                digest.update("".join(values.map(lambda text: f"{len(text)}:{text}")).encode())
+            else:
+                # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
+                values = values + values.dtype.type(0)
+                digest.update(values.astype(values.dtype.newbyteorder("<"), copy=False))
         return digest.hexdigest()
 
     def select(self, mask: ArrayLike) -> Observations:
@@ -222,15 +227,17 @@ class Observations(FrameRows, Sourced, Shown):
         ObservationError
             If a range holds no frame of the table.
         """
-        ids = self.frame_ids
-        inside = [ids[(ids >= first) & (ids <= last)] for first, last in ranges]
-        for (first, last), found in zip(ranges, inside, strict=True):
-            if not len(found):
+        frame = self.frame
+        chosen = np.zeros(len(self), dtype=np.bool_)
+        for first, last in ranges:
+            inside = (frame >= first) & (frame <= last)
+            if not inside.any():
                 asked = str(first) if first == last else f"{first}-{last}"
                 raise ObservationError(
-                    f"there is no frame {asked}: the table has {ids[0]} to {ids[-1]}."
+                    f"there is no frame {asked}: the table has {frame[0]} to {frame[-1]}."
                 )
-        return self.select_frames(np.unique(np.concatenate(inside)))
+            chosen |= inside
+        return self.select(chosen)
 
     def with_meta(self, **entries: Any) -> Observations:
         """The same table with entries of `meta` added or changed, such as
@@ -265,7 +272,7 @@ class Observations(FrameRows, Sourced, Shown):
 
     def head(self, n: int = 5) -> Any:
         """The first `n` rows as a pandas DataFrame."""
-        return self.to_dataframe().head(n)
+        return self.select(np.arange(len(self)) < n).to_dataframe()
 
     def save(self, path: PathLike, force: bool = False, camera: Camera | None = None) -> None:
         """Write the table without loss of digits; the ending decides what as.
@@ -370,8 +377,8 @@ class Observations(FrameRows, Sourced, Shown):
     def with_time(self, time: Any) -> Observations:
         """The same table with a time (UTC; text, datetime or astropy Time) for rows without one."""
         text = utc_text(time)
-        there = np.full(len(self), "") if self.time_utc is None else self.time_utc
-        return replace(self, time_utc=Texts.of(there).map(lambda stated: stated or text))
+        there = Texts.unknown(len(self)) if self.time_utc is None else Texts.of(self.time_utc)
+        return replace(self, time_utc=there.map(lambda stated: stated or text))
 
     def __repr__(self) -> str:
         return (
@@ -415,9 +422,9 @@ def load_observations(
     tables = [load_observations(one, camera, columns) for one in path]
     if not tables:
         raise ObservationError("observations: there is no file; give at least one.")
-    columns_of = [table.columns for table in tables]
-    common = [name for name in columns_of[0] if all(name in columns for columns in columns_of)]
-    joined = {name: _joined([columns[name] for columns in columns_of]) for name in common}
+    joined = joined_columns(tables)
+    for name in joined.keys() - set.intersection(*(set(table.columns) for table in tables)):
+        del joined[name]
     starts = np.cumsum([0, *(table.n_frames for table in tables)])
     joined["frame"] = np.concatenate(
         [np.searchsorted(t.frame_ids, t.frame) + n for t, n in zip(tables, starts, strict=False)]
@@ -445,10 +452,6 @@ def _array(name: str, values: Any) -> Any:
     return typed("observations", name, array, _DTYPES[kind])
 
 
-def _all_missing(values: Any) -> bool:
-    return bool(np.all(values == "" if values.dtype.kind == "U" else np.isnan(values)))
-
-
 def joined_columns(tables: Sequence[Observations], **instead: Sequence[FloatArray]) -> AnyDict:
     """All rows of several tables; a column that only some have is filled, or left out where it may
     have no gaps.
@@ -459,17 +462,9 @@ def joined_columns(tables: Sequence[Observations], **instead: Sequence[FloatArra
         missing = [value is None for value in values]
         if all(missing) or (any(missing) and not column.gaps):
             continue
-        gap: Any = "" if column.kind == "text" else np.nan
-        columns[name] = _joined(
-            [
-                np.full(len(table), gap) if v is None else v
-                for table, v in zip(tables, values, strict=True)
-            ]
-        )
+        gaps: Any = Texts.unknown if column.kind == "text" else partial(np.full, fill_value=np.nan)
+        parts = [
+            gaps(len(table)) if v is None else v for table, v in zip(tables, values, strict=True)
+        ]
+        columns[name] = (Texts.joined if isinstance(parts[0], Texts) else np.concatenate)(parts)
     return columns
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    """A column of several tables, one after the other."""
-    texts = any(isinstance(part, Texts) for part in parts)
-    return Texts.joined(parts) if texts else np.concatenate(parts)

@@ -20,8 +20,7 @@ from starcal_uq.core.files import (
     ensure_new,
     table_ending,
 )
-from starcal_uq.core.tables import coded, write_parquet
-from starcal_uq.core.texts import Texts
+from starcal_uq.core.tables import write_parquet
 from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import WRITTEN
@@ -81,15 +80,15 @@ def write_table(
         if ending == ".ecsv":
             astropy_table(columns, plain).write(temporary, format="ascii.ecsv", delimiter=",")
         else:
-            write_parquet(columns, temporary, json.dumps(plain))
+            # Pixels repeat nowhere: looking for repeats in them takes as long as all the rest.
+            repeating = [name for name in columns if name not in ("x_px", "y_px")]
+            write_parquet(columns, temporary, json.dumps(plain), use_dictionary=repeating)
 
 
 def _csv_text(columns: AnyMapping) -> str:
     texts = []
     for name, values in columns.items():
-        cells = values.tolist()
-        if COLUMNS[name].kind == "text":
-            cells = list(map(cell_text, cells))
+        cells = (values.map(cell_text) if COLUMNS[name].kind == "text" else values).tolist()
         # An empty cell is how every spreadsheet writes a gap.
         texts.append(["" if v != v else v for v in cells] if COLUMNS[name].gaps else cells)
     text = io.StringIO(newline="")
@@ -97,24 +96,3 @@ def _csv_text(columns: AnyMapping) -> str:
     writer.writerow(columns)
     writer.writerows(zip(*texts, strict=True))
     return text.getvalue()
-
-
-def write_partition(
-    columns: AnyMapping,
-    meta: AnyDict,
-    path: Path,
-) -> None:
-    """Write one Parquet file of a folder of partitions, atomically and quickly; overwritten."""
-    arrays = {name: columns[name] for name in COLUMNS if name in columns}
-    arrays |= {name: coded(text) for name, text in arrays.items() if isinstance(text, Texts)}
-    # Pixels repeat nowhere: looking for repeats in them, or compressing them, would take longer
-    # than all the rest.
-    pixels = {"x_px", "y_px"}
-    with atomic_path(path) as temporary:
-        write_parquet(
-            arrays,
-            temporary,
-            json.dumps(meta, default=as_plain),
-            compression={name: "none" if name in pixels else "zstd" for name in arrays},
-            use_dictionary=[name for name in arrays if name not in pixels],
-        )

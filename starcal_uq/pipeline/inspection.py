@@ -352,7 +352,7 @@ class Frames(Shown):
         for obs, rows in ((matched, np.arange(len(matched))), (self.used, used)):
             place = _nearest(obs.xy[rows], xy)[0]
             kind[place] = LEFT_OUT if obs is matched else IDENTIFIED
-            star[place] = "" if obs.star_id is None else obs.star_id[rows]
+            star[place] = obs.named[rows]
             mag[place] = np.nan if obs.mag is None else obs.mag[rows]
             if obs is not matched:
                 moved[place] = self.residuals_px[rows]

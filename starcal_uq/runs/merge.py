@@ -23,6 +23,7 @@ from starcal_uq.estimation.merging import (
 )
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.likelihood.compressed import optimum
+from starcal_uq.observations.checks import repeated_rows
 from starcal_uq.observations.repeats import Fingerprints, shared
 from starcal_uq.observations.table import Observations, joined_columns
 from starcal_uq.runs.run import Run
@@ -175,15 +176,11 @@ def _stated(table: Observations, factor: float) -> FloatArray:
 
 def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Sequence[str]) -> None:
     """The same centroid of the same star, to the last bit, is the same measurement."""
-    import pandas as pd
-
-    measured = ["x_px", "y_px", "ra_deg", "dec_deg"]
-    rows = pd.DataFrame({name: columns[name] for name in measured})
     owner = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
-    owners = rows.assign(owner=owner).drop_duplicates().groupby(measured)["owner"].agg(list)
-    several = owners[owners.map(len) > 1]
-    if len(several):
-        first, second, *_ = several.iloc[0]
+    twice = repeated_rows(*(columns[name] for name in ("x_px", "y_px", "ra_deg", "dec_deg")))
+    several = [owner[[early, late]] for late, early in twice if owner[early] != owner[late]]
+    if several:
+        first, second = several[0]
         raise CalibrationError(
             f"{names[second]}: {len(several)} of its stars are measurements that another run "
             f"holds too (first {names[first]}), which would count twice: leave one of the runs "

@@ -202,20 +202,21 @@ class Tracker:
         stars: StarCatalogue,
         rng: np.random.Generator,
         n_frames: int,
+        meta: AnyDict,
         attitudes: FloatArray | None = None,
-    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """Frame (N,), catalogue index (N,), noisy pixels (N, 2) and noise (N,) of the stars of
-        `frames`.
-        """
+    ) -> Observations:
+        """The stars of `frames` with noise, as a table that says `meta` of itself."""
         _, frames = self.frames(stars, rng, n_frames, attitudes)
         index, xy = map(np.concatenate, zip(*frames, strict=True))
         sigma = noise_of(self.noise, stars.mag[index], xy.T)
         xy = xy + sigma[:, None] * rng.standard_normal(xy.shape)
-        return (
-            np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]),
-            index,
-            xy,
-            sigma,
+        return Observations(
+            frame=np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]),
+            x_px=xy[:, 0],
+            y_px=xy[:, 1],
+            **stars.named(index),
+            sigma_px=None if one_noise(self.noise) is not None else sigma,
+            meta=meta,
         )
 
 
@@ -279,16 +280,8 @@ def simulate(
         check_memory(
             f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars
         )
-    rng = np.random.default_rng(seed)
-    frame, index, xy, sigma = tracker.observe(stars, rng, n_frames, attitudes)
-    return Observations(
-        frame=frame,
-        x_px=xy[:, 0],
-        y_px=xy[:, 1],
-        **stars.named(index),
-        sigma_px=None if one_noise(tracker.noise) is not None else sigma,
-        meta=simulated_meta(camera, tracker.noise, seed),
-    )
+    meta = simulated_meta(camera, tracker.noise, seed)
+    return tracker.observe(stars, np.random.default_rng(seed), n_frames, meta, attitudes)
 
 
 def simulated_meta(camera: Camera, noise: Noise, seed: int) -> AnyDict:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -15,11 +15,9 @@ from starcal_uq.core.errors import ObservationError, RunFolderError, SettingErro
 from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.settings import Seed, bounded, seed_of
-from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
-from starcal_uq.observations.written import write_partition
 from starcal_uq.simulation.frames import Tracker, TrackerOptions, simulated_meta
 from starcal_uq.simulation.noise import one_noise
 
@@ -182,21 +180,11 @@ class _Maker:
             return False
 
     def __call__(self, number: int) -> None:
-        stars, meta = self.stars, self._meta(number)
+        meta = self._meta(number)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        frame, star, xy, sigma = self.tracker.observe(stars, rng, meta["n_frames"])
-        columns = {
-            "frame": frame + meta["first_frame"],
-            "x_px": xy[:, 0],
-            "y_px": xy[:, 1],
-            "ra_deg": stars.ra_deg[star],
-            "dec_deg": stars.dec_deg[star],
-            "star_id": Texts.placed(star, stars.star_id),
-            "mag": stars.mag[star],
-        }
-        if one_noise(self.tracker.noise) is None:
-            columns["sigma_px"] = sigma
-        write_partition(columns, meta, self.folder / _NAME.format(number))
+        obs = self.tracker.observe(self.stars, rng, meta["n_frames"], meta)
+        obs = replace(obs, frame=obs.frame + meta["first_frame"])
+        obs.save(self.folder / _NAME.format(number), force=True)
 
 
 def _make_all(

@@ -61,7 +61,7 @@ def test_parts_keep_their_own_names_alone():
 
 
 def test_joined_and_mapped_columns_merge_equal_texts():
-    joined = Texts.joined([TEXTS, ["c", "a"], np.array([""])])
+    joined = Texts.joined([TEXTS, Texts.of(["c", "a"]), Texts.unknown(1)])
     assert joined.tolist() == [*CELLS, "c", "a", ""]
     assert joined.names.tolist() == ["", "a", "b", "c", "ä 10"]
     short = TEXTS.map(lambda text: text[:0])

@@ -201,7 +201,7 @@ def rejected_table(
     data: AnyDict = {
         "row": rows,
         "frame": obs.frame[rows],
-        "star_id": [""] * len(rows) if obs.star_id is None else obs.star_id[rows].tolist(),
+        "star_id": obs.named[rows].tolist(),
         "x_px": obs.x_px[rows],
         "y_px": obs.y_px[rows],
         "residual_px": residuals.residual_px[rows],

@@ -318,7 +318,7 @@ def _beyond_tails(obs: Observations, cal: Calibration) -> list[AnyDict]:
     beyond = obs.n_stars * (nu / (nu + 2.0) * weights) ** (0.5 * nu) < TAILS_P
     distance = np.hypot(*cal.residuals_px.T)
     rows = sorted(np.flatnonzero(beyond), key=lambda row: -distance[row])
-    names = obs.star_id if obs.star_id is not None else np.full(obs.n_stars, "")
+    names = obs.named
     return [
         {"frame": int(obs.frame[i]), "star": str(names[i]), "x_px": float(obs.xy[i, 0]),
          "y_px": float(obs.xy[i, 1]), "residual_px": float(distance[i])}

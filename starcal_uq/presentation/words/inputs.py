@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pandas as pd
-
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import pretty_unit
@@ -34,6 +32,6 @@ def camera_table(camera: Camera) -> TextTable:
 
 def observations_table(obs: Observations) -> TextTable:
     """The first rows: five decimals are a hundredth of a milli-pixel and 0.04 arcsec."""
-    head = pd.DataFrame({name: values[:_FIRST_ROWS] for name, values in obs.columns.items()})
+    head = obs.head(_FIRST_ROWS)
     formats = {name: "{:.5f}".format for name in head if COLUMNS[name].kind == "number"}
     return TextTable.of(head, formats=formats)
