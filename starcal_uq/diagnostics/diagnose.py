@@ -31,7 +31,7 @@ from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackkn
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
 from starcal_uq.diagnostics.models import ModelComparison, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
-from starcal_uq.diagnostics.residuals import of_heard
+from starcal_uq.diagnostics.residuals import of_heard, of_some_frames
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.diagnostics.times import (
     TimeTest,
@@ -56,6 +56,9 @@ if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
+# Frames, where there are more, of which the tests that find all that matters in so many are made;
+# for errors of the stars, whose effect grows beside the noise of more frames.
+_FRAMES, _STAR_FRAMES = 10_000, 20_000
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's
 # longer side.
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
@@ -170,7 +173,9 @@ class Diagnosis(Shown, Saved):
     @property
     def better(self) -> str | None:
         """The model that the comparison prefers, empty if none; None without a comparison."""
-        return None if self.comparison is None else self.comparison.better
+        found = self.comparison
+        # What some frames do not show, all may.
+        return None if found is None else found.better or (None if found.of_frames else "")
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
@@ -217,9 +222,9 @@ def diagnose_apart(
     sample.
     """
     cal, whole = without_ties(obs, cal), whole if whole is None else without_ties(obs, whole)
-    stars = star_test(obs, cal)
+    stars = star_test(*of_some_frames(weighed(obs, cal), cal, _STAR_FRAMES, seed))
     rest = remainder(obs, cal, seed)
-    misfit = misfit_tests(obs, whole or cal)
+    misfit = misfit_tests(obs, whole or cal, most_frames=_FRAMES, seed=seed)
     asked, assessed = extended(obs, whole or cal, misfit)
     return Apart(
         misfit=misfit,
@@ -340,19 +345,22 @@ def leave_frames_out(
     """The two tests that leave frames out, which share what the frames say about the parameters."""
     cal = without_ties(obs, cal)
     models = rivals(cal.camera.distortion) if models is None else models
+    obs, cal, of_frames = of_some_frames(weighed(obs, cal), cal, _FRAMES, seed)
     normals = None if cal.known_effects.fitted else FrameNormals.at(obs, cal)
     comparison = None
     # A single frame cannot be left out, and a field holds what other models would add to the lens.
     if models and obs.n_frames > 1 and "field" not in cal.known_effects.names:
-        comparison = compare_models(obs, cal, models, seed=seed, normals=normals)
-    return LeftOut(_jackknife(obs, cal, normals), comparison)
+        comparison = compare_models(
+            obs, cal, models, seed=seed, normals=normals, of_frames=of_frames
+        )
+    return LeftOut(_jackknife(obs, cal, normals, of_frames), comparison)
 
 
 def _jackknife(
-    obs: Observations, cal: Calibration, normals: FrameNormals | None
+    obs: Observations, cal: Calibration, normals: FrameNormals | None, of_frames: int
 ) -> Jackknife | None:
     try:
-        return jackknife_frames(obs, cal, normals)
+        return jackknife_frames(obs, cal, normals, of_frames)
     except StarcalError:
         # Too few frames: the report then says that there is none.
         return None

@@ -55,6 +55,9 @@ class Jackknife(Shown):
         more than Satterthwaite's degrees of freedom of `sandwich_covariance`.
     n_frames : int
         K.
+    of_frames : int
+        Frames of the estimate, of which these K are a sample: covariances and estimates are those
+        that all frames have if they are like these. 0 where K are all.
     residual_dof : int
         Degrees of freedom of the noise in `formal_covariance`; 0 in earlier files, which took it
         as known.
@@ -72,6 +75,7 @@ class Jackknife(Shown):
     n_frames: int
     residual_dof: int = 0
     tail_dof: FloatArray | None = None
+    of_frames: int = 0
 
     SHAPES: ClassVar = """
         p: parameter_names effective_frames tail_dof
@@ -166,7 +170,10 @@ class Jackknife(Shown):
 
 
 def jackknife_frames(
-    obs: Observations, cal: Calibration, normals: FrameNormals | None = None
+    obs: Observations,
+    cal: Calibration,
+    normals: FrameNormals | None = None,
+    of_frames: int = 0,
 ) -> Jackknife:
     """Leave each frame out in turn, by one Gauss-Newton step from the estimate.
 
@@ -176,6 +183,8 @@ def jackknife_frames(
         The data and the estimate made from them.
     normals : FrameNormals, optional
         The frames' normal equations, where they are at hand.
+    of_frames : int
+        Frames of the estimate, where these are a sample.
 
     Raises
     ------
@@ -197,7 +206,11 @@ def jackknife_frames(
             f"without frame {frame} the parameters are not determined: a jackknife needs more "
             "frames like it."
         )
-    return _jackknife(normals.scatter(), cal, normals.theta + z * normals.scale)
+    if of_frames:
+        # The best estimate of these frames is a little beside that of all.
+        z = (z - z.mean(axis=0)) * (obs.n_frames / of_frames)
+    left_out = normals.theta + z * normals.scale
+    return _jackknife(normals.scatter(), cal, left_out, of_frames)
 
 
 def jackknife_of_all(cal: Calibration) -> Jackknife | None:
@@ -212,8 +225,12 @@ def jackknife_of_all(cal: Calibration) -> Jackknife | None:
     return _jackknife(found, cal, np.empty((0, len(found.theta))))
 
 
-def _jackknife(found: FrameScatter, cal: Calibration, left_out: FloatArray) -> Jackknife:
+def _jackknife(
+    found: FrameScatter, cal: Calibration, left_out: FloatArray, of_frames: int = 0
+) -> Jackknife:
     unit = np.outer(found.scale, found.scale)
+    if of_frames:
+        unit *= found.n_frames / of_frames
     clustered, dof, tail_dof = found.clustered
     return Jackknife(
         parameter_names=cal.parameter_names,
@@ -225,4 +242,5 @@ def _jackknife(found: FrameScatter, cal: Calibration, left_out: FloatArray) -> J
         n_frames=found.n_frames,
         residual_dof=found.dof - len(found.theta),
         tail_dof=tail_dof,
+        of_frames=of_frames,
     )

@@ -26,7 +26,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import Freed, without_effects
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF, MisfitTest
 from starcal_uq.diagnostics.noise_tests import NoiseSums, noise_weights
-from starcal_uq.diagnostics.residuals import of_heard
+from starcal_uq.diagnostics.residuals import of_heard, of_some_frames
 from starcal_uq.diagnostics.shape_sums import ShapeSums
 from starcal_uq.estimation.noise_model import AxisSums, fit_noise, sigma_ratios
 from starcal_uq.estimation.weights import weighed
@@ -100,6 +100,11 @@ class Misfit(Shown):
         """
         return min((test.p_holm for test in self.tests), default=1.0)
 
+    @property
+    def n_asked(self) -> int:
+        """Frames that tests for unequal noise, and for frames that differ, are made from."""
+        return round(min((test.share for test in self.tests), default=1.0) * self.n_frames)
+
     def found(self, alpha: float = ALPHA) -> tuple[MisfitTest, ...]:
         """Tests that reject at this level after correction, the strongest first."""
         return tuple(
@@ -119,7 +124,14 @@ class Misfit(Shown):
 
 
 @one_thread()
-def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CELLS) -> Misfit:
+def misfit_tests(
+    obs: Observations,
+    cal: Calibration,
+    *,
+    max_cells: int = MAX_CELLS,
+    most_frames: int | None = None,
+    seed: int = 0,
+) -> Misfit:
     """Test the residuals of a calibration for unexplained structure.
 
     Parameters
@@ -129,6 +141,11 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         3 alone are not at its optimum, and the tests then include that).
     max_cells : int
         Largest number of field cells along the longer side.
+    most_frames : int, optional
+        Frames of which, where there are more, the tests for unequal noise and for frames that differ
+        are made, and the covariance of the shapes in the others; all by default, and beside effects.
+    seed : int
+        Seed of the choice of these frames.
 
     Returns
     -------
@@ -141,20 +158,23 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     obs = weighed(obs, cal)
     obs, cal = of_heard(obs, cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
-    sums = ShapeSums(obs, cal, families)
-    tests = [test for test in (sums.family(family) for family in families) if test is not None]
+    some, own, of_frames = of_some_frames(obs, cal, most_frames, seed)
+    places = np.flatnonzero(np.isin(obs.frame, some.frame_ids)) if of_frames else None
+    sums, share = ShapeSums(some, own, families, places), some.n_frames / obs.n_frames
+    every = sums.for_all(obs, cal) if of_frames else sums
+    tests = [test for test in (every.family(family) for family in families) if test is not None]
     if (test := sums.frame_by_frame()) is not None:
-        tests.append(test)
-    gram, weights = sums.gram[: sums.p + 1, : sums.p + 1], noise_weights(obs, cal.camera)
-    noise = NoiseSums(Freed.pieces(obs, cal, gram), weights, bool(cal.known_effects.fitted))
+        tests.append(replace(test, share=share))
+    gram, weights = sums.gram[: sums.p + 1, : sums.p + 1], noise_weights(some, cal.camera)
+    noise = NoiseSums(Freed.pieces(some, own, gram), weights, bool(cal.known_effects.fitted))
     of_noise = []
     if noise.dof >= LEAST_DOF:
         of_noise = [(f"noise that changes with {name}", name, z, p) for name, z, p in noise.tests()]
     if (frames := noise.by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
     axes = noise.axes
-    if obs.noise_axes is not None:
-        alike, axes = Freed.of(replace(obs, noise_axes=None), cal), AxisSums()
+    if some.noise_axes is not None:
+        alike, axes = Freed.of(replace(some, noise_axes=None), own), AxisSums()
         axes.add(alike.frames, alike.a, alike.h, alike.e)
     names = "noise that differs between the axes", "noise whose axes correlate"
     known = noise_model_of(cal)
@@ -162,25 +182,26 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         of_noise.append((name, "axis", z, float(2.0 * ndtr(-abs(z)))))
     nothing = float("nan")
     tests += [
-        MisfitTest(name, against, z, 0, noise.dof, p, 1.0, nothing, nothing)
+        MisfitTest(name, against, z, 0, noise.dof, p, 1.0, nothing, nothing, share=share)
         for name, against, z, p in of_noise
     ]
     corrected = holm([test.p_value for test in tests])
-    unit = np.sqrt(sums.rss / sums.dof / (2.0 * obs.n_stars)) * sums.noise_px
     tests = [
         replace(
-            test, p_holm=float(p), detectable_px=float(unit * _detectable(test, ALPHA / len(tests)))
+            test,
+            p_holm=float(p),
+            detectable_px=test.detectable_px * _detectable(test, ALPHA / len(tests)),
         )
         for test, p in zip(tests, corrected, strict=True)
     ]
     uneven = None
     if any(test.is_of_noise and test.p_holm < ALPHA for test in tests) and cal.noise_model is None:
-        clean = without_effects(obs, cal)
+        clean = without_effects(some, own)
         model, _ = fit_noise(clean, cal.camera, rounds=_NOISE_ROUNDS)
         uneven = UnevenNoise(
             model, cal.parameter_names, sigma_ratios(clean, cal.camera, model, cal.sigma)
         )
-    sigma = float(np.sqrt(sums.rss / sums.dof))
+    sigma = float(np.sqrt(every.rss / every.dof))
     return Misfit(tuple(tests), sigma, obs.n_stars, obs.n_frames, uneven)
 
 

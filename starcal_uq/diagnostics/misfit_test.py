@@ -63,6 +63,8 @@ class MisfitTest:
     moved_std : float
         Standard error of that change, in the same unit: large where shapes can hardly be separated
         from the parameter.
+    share : float
+        Share of the frames that it is made from.
     detectable_px : float
         Root mean square per axis of a pattern that the test finds nine times in ten, at level ALPHA
         of all tests together, px; NaN for unequal noise.
@@ -82,6 +84,7 @@ class MisfitTest:
     moved_name: str = ""
     detectable_px: float = float("nan")
     moved_std: float = float("nan")
+    share: float = 1.0
 
     @property
     def is_of_noise(self) -> bool:

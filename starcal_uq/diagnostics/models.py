@@ -117,6 +117,8 @@ class ModelComparison(Shown):
     n_frames, n_sampled_frames : int
         Frames, and those of them whose densities were sampled; the others are in closed form. 0 in
         a comparison of a version that sampled all.
+    of_frames : int
+        Frames of the calibration, of which `n_frames` are a sample; 0 where they are all.
     """
 
     scores: tuple[ModelScore, ...]
@@ -124,6 +126,7 @@ class ModelComparison(Shown):
     failed: dict[str, str]
     n_frames: int = 0
     n_sampled_frames: int = 0
+    of_frames: int = 0
 
     GONE: ClassVar = ("share",)
 
@@ -175,6 +178,7 @@ def compare_models(
     n_draws: int = _DRAWS,
     seed: Seed = 0,
     normals: FrameNormals | None = None,
+    of_frames: int = 0,
 ) -> ModelComparison:
     """Compare distortion models by cross-validation over frames.
 
@@ -191,6 +195,8 @@ def compare_models(
         Seed of the draws.
     normals : FrameNormals, optional
         The frames' normal equations of a calibration without effects, where they are at hand.
+    of_frames : int
+        Frames of the calibration, where these are a sample.
 
     Raises
     ------
@@ -201,16 +207,19 @@ def compare_models(
     obs = without_effects(obs, cal)
     own = cal.camera.distortion
     names = tuple(dict.fromkeys((own, *(rivals(own) if models is None else models))))
-    fits, failed = {} if normals is None else {own: normals}, {}
+    fits, failed = {} if normals is None or of_frames else {own: normals}, {}
     for name in names:
         try:
-            fits[name] = fits.get(name) or _normals(obs, cal, name)
+            fits[name] = fits.get(name) or _normals(obs, cal, name, bool(of_frames))
         except StarcalError as error:
             failed[name] = str(error)
     if not fits:
         raise StarcalError(
             f"no distortion model could be calibrated: {next(iter(failed.values()))}"
         )
+    # Attitudes by the estimate of these frames: that of all is beside those of the other models.
+    alone = of_frames and own in fits
+    attitudes = rotation_to_quaternion(fits[own].rotations) if alone else cal.quaternions
     rng = np.random.default_rng(seed)
     found_scores = {name: _leave_out(normals, n_draws, rng) for name, normals in fits.items()}
     best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
@@ -220,7 +229,7 @@ def compare_models(
         loo = found_scores[name]
         difference = loo.pointwise - reference
         total = float(np.sum(difference))
-        common, rest = _moved(cal, normals)
+        common, rest = _moved(attitudes, normals)
         scores.append(
             ModelScore(
                 model=name,
@@ -248,6 +257,7 @@ def compare_models(
         failed,
         n_frames=obs.n_frames,
         n_sampled_frames=sampled,
+        of_frames=of_frames,
     )
 
 
@@ -262,17 +272,19 @@ def _beyond_doubt(pointwise: FloatArray) -> float:
     )
 
 
-def _normals(obs: Observations, cal: Calibration, name: str) -> FrameNormals:
-    """Normal equations at the optimum of a model."""
-    if name == cal.camera.distortion:
+def _normals(obs: Observations, cal: Calibration, name: str, of_these: bool) -> FrameNormals:
+    """Normal equations at the optimum of a model; of the calibration's own one at its estimate, or
+    at that of these frames.
+    """
+    if name == cal.camera.distortion and not of_these:
         return FrameNormals.at(obs, cal)
     return FrameNormals.around(obs, name, *refit(obs, cal, name))
 
 
 def _moved(
-    cal: Calibration, normals: FrameNormals
+    attitudes: FloatArray, normals: FrameNormals
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    phi = left_error(rotation_to_quaternion(normals.rotations), cal.quaternions) * ARCSEC
+    phi = left_error(rotation_to_quaternion(normals.rotations), attitudes) * ARCSEC
     common = phi.mean(axis=0)
     rest = np.sqrt(np.mean((phi - common) ** 2, axis=0))
     c, r = common.tolist(), rest.tolist()

@@ -12,6 +12,7 @@ import numpy as np
 from starcal_uq.core.types import BoolArray, FloatArray, floats
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
 from starcal_uq.estimation.weights import by_noise_model, weighed
+from starcal_uq.observations.splits import one_of_each
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -116,7 +117,24 @@ def heard(obs: Observations, cal: Calibration) -> BoolArray:
 
 def of_heard(obs: Observations, cal: Calibration) -> tuple[Observations, Calibration]:
     """The stars that were heard, and the estimate with their residuals and frames alone."""
-    use = heard(obs, cal)
+    return _of_stars(obs, cal, heard(obs, cal))
+
+
+def of_some_frames(
+    obs: Observations, cal: Calibration, most: int | None, seed: int
+) -> tuple[Observations, Calibration, int]:
+    """At most so many frames, the estimate from all with their residuals and frames alone, and how
+    many frames all are; all of them, and 0, where there are no more, and beside effects.
+    """
+    if most is None or obs.n_frames <= most or cal.known_effects.fitted:
+        return obs, cal, 0
+    use = np.isin(np.arange(obs.n_frames), one_of_each(obs.n_frames, most, seed))
+    return *_of_stars(obs, cal, np.repeat(use, np.diff(obs.frame_starts))), obs.n_frames
+
+
+def _of_stars(
+    obs: Observations, cal: Calibration, use: BoolArray
+) -> tuple[Observations, Calibration]:
     if use.all():
         return obs, cal
     left = np.isin(cal.frame_ids, obs.frame[use])

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.beside import (
     by_frame,
 )
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF, Amplitude, MisfitTest
-from starcal_uq.likelihood.effect_sums import EffectSums, Solved
+from starcal_uq.likelihood.effect_sums import Columns, EffectSums, Solved
 from starcal_uq.likelihood.effects import Effect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import (
@@ -33,7 +34,7 @@ _ABSORBED = 1e-8
 # explain almost as large as the data could show it says how well their prior describes it, and not
 # what they leave.
 _SEEN = 0.1
-_STARS_AT_ONCE = 10_000
+_STARS_AT_ONCE, _ALL_AT_ONCE = 10_000, 20_000
 # Square of a scale that leaves coefficients free, in units of the noise and of the columns.
 _FREE = 1e10
 
@@ -44,16 +45,24 @@ class ShapeSums:
 
     Shapes are effects of the run without a prior: where a calibration has effects, everything is
     weighed by these.
+
+    `places` (N,): rows of the stars in the table that the shapes are of, where that is another one.
     """
 
-    def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
+    def __init__(
+        self,
+        obs: Observations,
+        cal: Calibration,
+        families: tuple[Shape, ...],
+        places: IntArray | None = None,
+    ) -> None:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         p, theta, effects = len(cal.theta), cal.theta, cal.known_effects.of(obs, cal.camera)
         self.p, self.dof = p, likelihood.dof - p
         self.names, self.n_stars = cal.parameter_names, obs.n_stars
         self.noise_px = float(np.sqrt(np.mean(obs.sigma_or_one**2)))
-        looked_for = [Effect(own.name, "run", own, np.ones(own.size)) for own in families]
-        sums = EffectSums([*effects, *looked_for], theta, cal.sigma)
+        self._looked_for = [Effect(own.name, "run", own, np.ones(own.size)) for own in families]
+        sums = EffectSums([*effects, *self._looked_for], theta, cal.sigma)
         frame = Effect("frame", "frame", frame_shapes(cal.camera), np.ones(3))
         held = any(effect.name == frame.name for effect in effects)
         of_frames = None if held else EffectSums([*effects, frame], theta, cal.sigma, apart=False)
@@ -61,11 +70,11 @@ class ShapeSums:
         self.places, self.block_rank, square = sums.places, 0, 0.0
         rotations = cal.rotations
         for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
-            h = state.slopes
+            h, where = state.slopes, rows if places is None else places[rows]
             fitted = part.project_out(state, np.concatenate([h, state.e[None]]))
-            sums.add(part, state, fitted, rows)
+            sums.add(part, state, fitted, where)
             if of_frames is not None:
-                own = of_frames.add(part, state, fitted, rows).frame
+                own = of_frames.add(part, state, fitted, where).frame
                 self.block_rank += int(by_frame(part.frames, own)[1].sum())
                 square += float(np.sum(own**2))
         # Squares of the columns before attitudes are removed
@@ -80,6 +89,24 @@ class ShapeSums:
         if of_frames is not None:
             free = ratio | {frame.name: _FREE * 3.0 * obs.n_frames / square}
             self.blocks = self.gram[: p + 1, : p + 1] - of_frames.solved(free).gram
+
+    def for_all(self, obs: Observations, cal: Calibration) -> ShapeSums:
+        """The sums over all frames, of which these are a sample, of a calibration without effects.
+
+        Products with the residuals, on which the power of the tests rests, are those of all stars;
+        products of parameters and columns, their covariance, are these scaled up.
+        """
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+        along = np.zeros(len(self.gram))
+        for part, state, rows in likelihood.pieces(cal.theta, cal.rotations, _ALL_AT_ONCE):
+            columns = Columns.of(self._looked_for, part, state, cal.theta, rows)
+            plain = np.concatenate([state.slopes, state.e[None]])
+            along += np.append(np.tensordot(plain, state.e, axes=2), columns.along(state.e))
+        found, more = copy(self), obs.n_stars / self.n_stars
+        found.n_stars, found.dof = obs.n_stars, likelihood.dof - self.p
+        found.raw, found.gram = self.raw * more, self.gram * more
+        found.gram[self.p] = found.gram[:, self.p] = along
+        return found
 
     @cached_property
     def alone(self) -> FloatArray:
@@ -112,6 +139,11 @@ class ShapeSums:
     def projection(self) -> FloatArray:
         """Inverse of the Gram matrix of the parameters, attitudes removed."""
         return scaled_inverse(self.gram[: self.p, : self.p])
+
+    @property
+    def unit_px(self) -> float:
+        """Root mean square per axis of a pattern whose square is one unit of the noise, px."""
+        return float(np.sqrt(self.rss / self.dof / (2.0 * self.n_stars)) * self.noise_px)
 
     @property
     def rss(self) -> float:
@@ -183,6 +215,7 @@ class ShapeSums:
             1.0,
             float(np.sqrt(excess)) * self.noise_px,
             float("nan"),
+            detectable_px=self.unit_px,
         )
 
 

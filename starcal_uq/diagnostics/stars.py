@@ -71,6 +71,9 @@ class StarTest(Shown):
     included_px, included_px_std : float
         Error that the calibration has estimated and marginalised, and its standard error; zero
         where it has none.
+    n_frames, of_frames : int
+        Frames that the test used, and those of the estimate, of which they are a sample; 0 where
+        it used all. Covariances are those that all frames have if they are like these.
     formal_covariance : (p, p) array
         Covariance if all images err independently.
     model_covariance : (p, p) array
@@ -97,6 +100,8 @@ class StarTest(Shown):
     jackknife_covariance: FloatArray
     included_px: float = 0.0
     included_px_std: float = 0.0
+    n_frames: int = 0
+    of_frames: int = 0
 
     SHAPES: ClassVar = """
         p: parameter_names
@@ -135,7 +140,7 @@ class StarTest(Shown):
 _PROBES = 16
 
 
-def star_test(obs: Observations, cal: Calibration) -> StarTest:
+def star_test(obs: Observations, cal: Calibration, of_frames: int = 0) -> StarTest:
     """Test whether stars bring errors of their own along, and how much that widens the
     uncertainties.
 
@@ -144,6 +149,9 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
     obs, cal
         The data and the estimate made from them. Stars are told apart by `star_id` where all have
         one, else by direction.
+    of_frames : int
+        Frames of the estimate, where these are a sample: what more frames of the same stars do not
+        average out is then larger beside their noise.
     """
     obs = without_effects(weighed(obs, cal), cal)
     focal = float(cal.theta[2])
@@ -160,7 +168,11 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
     steps = normals.left_out()
     spread = steps - steps.mean(axis=0)
     scores = normals.scores @ inverse
-    included = _included(cal)
+    included, share = _included(cal), obs.n_frames / (of_frames or obs.n_frames)
+    # Errors of the stars are the same in any number of frames; the noise is not.
+    model = inverse * own * share + pulled
+    growth = np.sqrt(np.diag(model) / np.diag(inverse * own + pulled))
+    clustered = unit * np.outer(growth, growth)
     return StarTest(
         parameter_names=cal.parameter_names,
         n_stars=s,
@@ -171,12 +183,14 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         tau_px_std=found.tau_std,
         visible_px=found.visible,
         arcsec_per_px=ARCSEC / focal,
-        formal_covariance=inverse * noise * unit,
-        model_covariance=(inverse * own + pulled) * unit,
-        sandwich_covariance=scores.T @ scores * s / (s - 1.0) * unit,
-        jackknife_covariance=spread.T @ spread * (s - 1.0) / s * unit,
+        formal_covariance=inverse * noise * share * unit,
+        model_covariance=model * unit,
+        sandwich_covariance=scores.T @ scores * s / (s - 1.0) * clustered,
+        jackknife_covariance=spread.T @ spread * (s - 1.0) / s * clustered,
         included_px=included[0],
         included_px_std=included[1],
+        n_frames=obs.n_frames if of_frames else 0,
+        of_frames=of_frames,
     )
 
 

@@ -52,7 +52,7 @@ class Columns:
         part: MarginalLikelihood,
         state: Profile,
         theta: FloatArray,
-        rows: slice,
+        rows: slice | IntArray,
     ) -> Columns:
         """The columns at these rows of the table, run, frame and star by themselves."""
         view = View.of(part, state, theta, rows)
@@ -80,7 +80,7 @@ class Columns:
         return _whitened(self.frames, *(e.columns.columns(self.view) for e in effects))
 
     @property
-    def _cells(self) -> Any | None:
+    def _cells(self) -> Any:
         """Columns (2 n, m) of the run's last effect, sparse, where each star is in one cell of it."""
         from scipy.sparse import csr_array
 
@@ -128,6 +128,12 @@ class Columns:
             products_by_frame(self.frames, self.frame, x),
             star.reshape(self.n_stars * len(self.star), len(x)),
         )
+
+    def along(self, e: FloatArray) -> FloatArray:
+        """Products (m,) of the run's columns, the last ones those of cells, with residuals (2, n)."""
+        # One effect after the other, whose columns stay in the cache.
+        own = [np.tensordot(self._shifts([each]), e, axes=2) for each in self.of_run[:-1]]
+        return np.concatenate([*own, e.ravel() @ self._cells])
 
     def products(self, added: FloatArray) -> Products:
         """Products with added columns (q, 2, n) and among themselves, attitudes projected out."""
@@ -264,7 +270,7 @@ class EffectSums:
         part: MarginalLikelihood,
         state: Profile,
         added: FloatArray,
-        rows: slice,
+        rows: slice | IntArray,
     ) -> Columns:
         """Add frames, with columns (q, 2, n)."""
         columns = Columns.of(self.effects, part, state, self._theta, rows)

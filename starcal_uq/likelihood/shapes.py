@@ -50,7 +50,7 @@ _LEAST_SPREAD = 1e-9
 class View:
     """Some frames, as the shapes see them."""
 
-    rows: slice  # Rows of the stars in the table
+    rows: slice | IntArray  # Rows of the stars in the table
     part: MarginalLikelihood  # Likelihood of the stars
     state: Profile  # The model at the best attitudes
     parameter_columns: (
@@ -59,7 +59,13 @@ class View:
     centre: FloatArray  # (2,): principal point, px
 
     @classmethod
-    def of(cls, part: MarginalLikelihood, state: Profile, theta: FloatArray, rows: slice) -> View:
+    def of(
+        cls,
+        part: MarginalLikelihood,
+        state: Profile,
+        theta: FloatArray,
+        rows: slice | IntArray,
+    ) -> View:
         """The stars of `part`, which are these rows of the table."""
         parameter_columns = part.frames.in_pixels(state.slopes)
         return cls(rows, part, state, parameter_columns, theta[:2])
@@ -382,13 +388,14 @@ class _TermColumns:
 
     def __call__(self, view: View) -> FloatArray:
         own = dict(zip(self.camera.parameter_names, self.camera.theta.tolist(), strict=True))
-        columns = []
-        for model_name, index in self.terms:
+        slopes = {}
+        for model_name in dict(self.terms):
             shared = ("x0", "y0", "f", *shared_names(model_name, self.camera.distortion))
             names = parameter_names(model_name)
             theta = np.array([own[name] if name in shared else 0.0 for name in names])
             richer = MarginalLikelihood(view.part.frames, model_name)
-            columns.append(richer.first(theta, view.state.b)[1][3 + index])
+            slopes[model_name] = richer.first(theta, view.state.b)[1][3:]
+        columns = [slopes[model_name][index] for model_name, index in self.terms]
         return view.part.frames.in_pixels(np.stack(columns))
 
 

@@ -134,7 +134,7 @@ def star_term(
     """
     axes, n_stars = sky_axes(directions, numbers), int(numbers.max()) + 1
 
-    def columns(part: MarginalLikelihood, state: Profile, rows: slice) -> FloatArray:
+    def columns(part: MarginalLikelihood, state: Profile, rows: slice | IntArray) -> FloatArray:
         z = offset_columns(part, state, axes[:, :, numbers[rows]], focal_px)
         return _turn(z) if rigid else z
 

@@ -44,7 +44,7 @@ class Term:
     n_groups: int
     # Whitened shifts (2, 2, n) of the images of some rows by coefficients of one, of the model of
     # their frames.
-    columns: Callable[[MarginalLikelihood, Profile, slice], FloatArray]
+    columns: Callable[[MarginalLikelihood, Profile, slice | IntArray], FloatArray]
 
 
 def add_by_group(total: FloatArray, values: FloatArray, groups: IntArray) -> None:
@@ -80,7 +80,7 @@ class TermSums:
         part: MarginalLikelihood,
         state: Profile,
         projected: FloatArray,
-        rows: slice,
+        rows: slice | IntArray,
         of_frames: FloatArray | None = None,
     ) -> None:
         """Add frames, with columns (q, 2, n) whose attitudes are projected out.

@@ -19,7 +19,10 @@ from starcal_uq.diagnostics.diagnose import (
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
+from starcal_uq.diagnostics.residuals import of_some_frames
+from starcal_uq.diagnostics.stars import star_test
 from starcal_uq.estimation.weights import weighed
+from starcal_uq.presentation.words.diagnostics import misfit_table
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
 from tests.helpers.scenes import observations
 
@@ -163,3 +166,40 @@ def test_starts_reach_the_optimum_of_noise_and_tails_together(obs):
     data = dataclasses.replace(some, x_px=some.x_px + noise[0], y_px=some.y_px + noise[1])
     cal = sc.calibrate(data, sc.paper.paper_start(), effects="noise,tails")
     assert multi_start(data, cal, 2).same == 2
+
+
+def test_of_many_frames_some_are_asked_and_the_checks_say_so(obs, cal, monkeypatch):
+    options = {"models": ("brown", "k1"), "n_starts": 0, "seed": 3}
+    every = diagnose(obs, cal, **options)
+    for name, n in (("_FRAMES", 30), ("_STAR_FRAMES", 40)):
+        monkeypatch.setattr(f"starcal_uq.diagnostics.diagnose.{name}", n)
+    some = diagnose(obs, cal, **options)
+    assert (some.comparison.n_frames, some.jackknife.n_frames, some.stars.n_frames) == (30, 30, 40)
+    assert {test.share for test in some.misfit.tests if test.is_of_noise} == {0.5}
+    # Sigmas are those of all frames.
+    for name in ("jackknife", "stars"):
+        covariances = (getattr(found, name).formal_covariance for found in (some, every))
+        assert np.divide(*map(np.diag, covariances)) == pytest.approx(1.0, abs=0.25)
+    for found in (some.jackknife, some.comparison):
+        assert "30 of 60 frames" in found.text
+    assert "40 of 60 frames" in some.stars.text
+    assert "30 of 60 frames" in misfit_table(some.misfit).title
+    assert some.better is None
+    # The control: all frames are no sample.
+    assert "0 of 60 frames" not in every.text + misfit_table(every.misfit).title
+    assert every.better == ""
+
+
+def test_stars_that_err_widen_sigma_in_a_sample_as_in_all_frames():
+    obs = observations(n_frames=60)
+    stars, place = np.unique(obs.star_id, return_inverse=True)
+    shifts = np.random.default_rng(4).normal(0.0, 0.01, (2, len(stars)))[:, place]
+    obs = dataclasses.replace(obs, ra_deg=obs.ra_deg + shifts[0], dec_deg=obs.dec_deg + shifts[1])
+    cal = sc.calibrate(obs, sc.paper.paper_start())
+    every = star_test(obs, cal)
+    some = star_test(*of_some_frames(obs, cal, 40, 1))
+    assert every.p_value < 1e-3
+    assert some.widening == pytest.approx(every.widening, rel=0.3)
+    # The control: what is taken for all frames is less wide.
+    alone = star_test(*of_some_frames(obs, cal, 20, 1)[:2])
+    assert np.all(alone.widening < every.widening)

@@ -10,6 +10,7 @@ from scipy import stats
 import starcal_uq as sc
 from starcal_uq.camera.distortion import parameter_names, rivals
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
+from starcal_uq.diagnostics.residuals import of_some_frames
 from starcal_uq.diagnostics.shape_sums import ShapeSums
 from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -51,6 +52,23 @@ def null():
         np.array([[t.p_value for t in f.tests] for f in found]),
         np.array([f.p_value for f in found]),
     )
+
+
+def test_patterns_are_sought_in_all_stars_with_the_covariance_of_some_frames():
+    obs = observations("brown", n_frames=120)
+    wave = np.sin(2.0 * np.pi * obs.x_px)
+    obs = moved(obs, (0.02 * wave, 0.0 * wave))
+    cal = sc.calibrate(obs, nominal(camera("brown")))
+    every, some = misfit_tests(obs, cal), misfit_tests(obs, cal, most_frames=60, seed=2)
+    for one, other in zip(every.tests, some.tests, strict=True):
+        if other.share == 1.0:
+            assert other.statistic == pytest.approx(one.statistic, rel=0.2, abs=0.2), one.name
+            assert other.dof_residual == one.dof_residual
+    phase = "error with the pixel phase in x"
+    assert named(some, phase).statistic > 10.0
+    # The control: the same frames alone see half of it.
+    alone, own, _ = of_some_frames(obs, cal, 60, 2)
+    assert named(misfit_tests(alone, own), phase).statistic < 0.75 * named(some, phase).statistic
 
 
 @pytest.mark.parametrize("stated", [False, True])

@@ -92,11 +92,11 @@ def of_misfit(
 
 
 def _noncentrality(test: MisfitTest) -> float:
-    """What a pattern adds to the sum of squares, in units of the noise that is stated, which holds
-    the pattern.
+    """What a pattern adds to the sum of squares of all frames, in units of the noise that is stated,
+    which holds the pattern.
     """
     freed = test.dof + test.dof_residual
-    beside = freed / (test.dof_residual + test.dof * test.statistic)
+    beside = freed / (test.dof_residual + test.dof * test.statistic) / test.share
     return test.dof * (test.statistic - 1.0) * beside
 
 

@@ -262,6 +262,7 @@ def even_noise(found: Misfit, helping: Remedies = ()) -> Check:
     facts: AnyDict = {
         "p_value": min(p_values, default=1.0),
         "tests": tuple(test.name for test in rejected),
+        **_asked(found.n_asked, found.n_frames),
     }
     level = Level.PASS
     remedies: Remedies = ()
@@ -299,12 +300,18 @@ def jackknife(found: Jackknife, moving: Remedies = ()) -> Check:
             "most": float(found.ratio.max()),
             "parameter": found.parameter_names[worst],
             "disagreeing": tuple(compress(found.parameter_names, bad)),
+            **_asked(found.n_frames, found.of_frames),
         },
         {"ratio_most": max(float(chance[worst]), JACKKNIFE_RATIO)},
         moving,
         () if moving else (Order(_OF_FRAMES),),
         good=not np.any(bad),
     )
+
+
+def _asked(n_frames: int, of_frames: int) -> AnyDict:
+    """Frames that a check is made from and those of the estimate, where the first are a sample."""
+    return {"n_frames": n_frames, "of_frames": of_frames} if n_frames < of_frames else {}
 
 
 STAR_REMEDY = calibrated(effects="star")
@@ -332,6 +339,7 @@ def star_facts(found: StarTest) -> AnyDict:
     facts: AnyDict = {
         "included_px": found.included_px,
         "included_std_px": found.included_px_std,
+        **_asked(found.n_frames, found.of_frames),
     }
     if not found.applicable:
         return facts
@@ -357,7 +365,8 @@ def comparison(models: ModelComparison, attitude: AttitudeError | None = None) -
     remedies: Remedies = ()
     if mine is not None and mine.rejected:
         # A gain of one nat is what a displacement gives whose square is two units of the noise.
-        bent = on_directions(-2.0 * mine.difference, mine.n_parameters)
+        more = models.of_frames / models.n_frames if models.of_frames else 1.0
+        bent = on_directions(-2.0 * mine.difference * more, mine.n_parameters)
         effect = largest([bent, *on_attitudes(attitude)])
         level, remedies = effect.level, with_model(models.better)
         facts |= effect.facts
@@ -370,6 +379,7 @@ def model_facts(models: ModelComparison) -> AnyDict:
     """
     mine, simplest = models.of(models.fitted), models.simplest
     facts: AnyDict = {"fitted": models.fitted, "best": models.scores[0].model}
+    facts |= _asked(models.n_frames, models.of_frames)
     if mine is not None:
         facts |= {
             "difference_nat": mine.difference,

@@ -43,11 +43,18 @@ def verdict_notes(verdict: Verdict) -> list[str]:
 
 def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
     """One row per test; what found something is marked, and alone has amplitudes where so asked."""
-    return table("misfit", {"level": MISFIT_P, "brief": found_only}, it=found.tests)
+    given: AnyDict = {"level": MISFIT_P, "brief": found_only}
+    given |= {"n_frames": found.n_asked, "of_frames": found.n_frames}
+    return table("misfit", given, it=found.tests)
 
 
 def _sigmas(
-    of: str, specs: Sequence[Parameter], covariances: Iterable[FloatArray], /, **columns: Any
+    of: str,
+    found: Jackknife | StarTest,
+    specs: Sequence[Parameter],
+    covariances: Iterable[FloatArray],
+    /,
+    **columns: Any,
 ) -> TextTable:
     """A table with sigmas in the units of `specs`, or in px units."""
     scales = scales_of(specs) if specs else 1.0
@@ -57,7 +64,8 @@ def _sigmas(
         for kind, matrix in zip(kinds, covariances, strict=False)
     }
     units = [spec.scaled_unit for spec in specs] or [""] * len(columns["ratio"])
-    return table(of, None, () if specs else ("Unit",), unit=units, **columns, **sigmas)
+    given = {"n": found.n_frames, "of": found.of_frames}
+    return table(of, given, () if specs else ("Unit",), unit=units, **columns, **sigmas)
 
 
 def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTable:
@@ -65,6 +73,7 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
     low, high = found.expected()
     return _sigmas(
         "jackknife",
+        found,
         specs,
         (found.formal_covariance, found.sandwich_covariance),
         name=found.parameter_names,
@@ -84,7 +93,8 @@ def star_table(found: StarTest, specs: Sequence[Parameter] = ()) -> TextTable:
         found.model_covariance,
         found.jackknife_covariance,
     )
-    return _sigmas("stars", specs, covariances, name=found.parameter_names, ratio=found.widening)
+    names, ratio = found.parameter_names, found.widening
+    return _sigmas("stars", found, specs, covariances, name=names, ratio=ratio)
 
 
 def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fitted") -> TextTable:
@@ -93,6 +103,7 @@ def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fi
     """
     given: AnyDict = {"mine": found.fitted, "fitted": fitted, "unit": sigma_unit}
     given |= {"n_sampled": found.n_sampled_frames, "n_frames": found.n_frames}
+    given |= {"of_frames": found.of_frames}
     return table("models", given, it=found.scores)
 
 
