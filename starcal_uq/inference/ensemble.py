@@ -98,6 +98,15 @@ def run_ensembles(
     """
     import emcee
 
+    class Sampler(emcee.EnsembleSampler):  # type: ignore[misc, unused-ignore]
+        """The one of emcee, which reads the density of every walker by itself."""
+
+        def compute_log_prob(self, coords: FloatArray) -> tuple[FloatArray, None]:
+            found = density(coords)
+            if np.isnan(found).any():
+                raise ValueError("the density of a walker is not a number")
+            return found, None
+
     weighted = make_moves(settings.moves) if moves is None else moves
     store = _Store(len(seeds), settings, dim, checkpoint, fingerprint)
     per_ensemble = settings.n_burn + settings.n_steps
@@ -107,9 +116,7 @@ def run_ensembles(
     with store.kept(), interrupt_between_steps() as check_interrupt:
         for index in range(store.ensemble, len(seeds)):
             state = store.state or _start(density, dim, seeds[index], settings.n_walkers)
-            sampler = emcee.EnsembleSampler(
-                settings.n_walkers, dim, density, moves=weighted, vectorize=True
-            )
+            sampler = Sampler(settings.n_walkers, dim, density, moves=weighted, vectorize=True)
             for first, last in _chunks(store.step, settings, chunk):
                 sampler.reset()
                 steps = sampler.sample(

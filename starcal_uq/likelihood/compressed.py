@@ -97,10 +97,10 @@ class CompressedLikelihood:
 
 
 def squares_by(gram: FloatArray, z: FloatArray) -> FloatArray:
-    """Sums of squares ``m(z)^T G m(z)`` (n,) by a Gram matrix (q, q) at z (n, p)."""
+    """Sums of squares ``m(z)^T G m(z)`` (..., n) by Gram matrices (..., q, q) at z (n, p)."""
     rows, columns = _pairs(z.shape[1])
     m = np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
-    return np.asarray(np.sum((m @ gram) * m, axis=1))
+    return np.asarray(np.sum((m @ gram) * m, axis=-1))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.likelihood.compressed import CompressedLikelihood, optimum
+from starcal_uq.likelihood.compressed import CompressedLikelihood, optimum, squares_by
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.shapes import Extent
 from starcal_uq.likelihood.zenith import Zeniths
@@ -259,13 +259,21 @@ class Effects(Shown):
         """Log likelihood (n,) at theta (n, p) and sigma (n,) with the scales integrated over their
         nodes.
         """
-        from scipy.special import logsumexp
-
         z = compressed.whiten(theta)
+        squares, *others = squares_by(np.stack([compressed.gram, *self.node_grams]), z)
+        apart = -0.5 * (np.stack(others) - squares) / np.square(sigma)
         plain = compressed.log_likelihood(theta, sigma)
-        squares = compressed.sum_of_squares(z)
-        others = np.stack(
-            [replace(compressed, gram=gram).sum_of_squares(z) for gram in self.node_grams]
-        )
-        apart = -0.5 * (others - squares) / np.square(sigma)
-        return np.asarray(plain + logsumexp(apart + self.node_log_weights[:, None], axis=0))
+        return plain + _log_sum_exp(apart + self.node_log_weights[:, None])
+
+
+def _log_sum_exp(values: FloatArray) -> FloatArray:
+    """Logarithm (n,) of the sum of exponentials of columns (m, n).
+
+    The formula of `scipy.special.logsumexp`, to the bit, without what that spends on every call.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        top = values.max(axis=0)
+        largest = values == top
+        count = largest.sum(axis=0, dtype=float)
+        rest = np.exp(np.where(largest, -np.inf, values - top)).sum(axis=0)
+        return np.asarray(np.log1p(rest / count) + np.log(count) + top)
