@@ -174,10 +174,12 @@ def calibrate(
     check_duplicates(settings.duplicates)
     settings.refuse_conflicts(scheduler=scheduler, workers=workers, partitioned=partitioned)
     calibration = _estimate(obs, camera, settings, throw, scheduler, workers, progress)
-    if throw:
+    if throw and not calibration.status.ok:
         raise_unless_good(calibration.status, calibration.remedy, calibration)
-    repeating = repeating_frames(calibration, settings.duplicates)
-    if not len(repeating) or not isinstance(obs, Observations):
+    if not isinstance(obs, Observations):
+        return calibration
+    repeating = repeating_frames(calibration, obs, settings.duplicates)
+    if not len(repeating):
         return calibration
     kept = obs.select_frames(np.setdiff1d(obs.frame_ids, repeating))
     rest = calibrate(kept, camera, settings, throw=throw, duplicates="keep")

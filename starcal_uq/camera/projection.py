@@ -104,12 +104,18 @@ def _rotated(b: Any, phi: Any) -> Any:
     return b + first + 0.5 * ca.cross(phi, first)
 
 
-def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
-    """Pixel position of the direction ``exp([phi]x) b`` (casadi.SX, 2)."""
+def _ideal(model_name: str, b: Any, theta: Any) -> Any:
+    """Ideal point of a direction (casadi.SX, 2)."""
+    import casadi as ca
+
+    return ca.vertcat(*get_model(model_name).plane.onto(_elements(b), theta[2]))
+
+
+def _pixel(model_name: str, s: Symbols, ideal: Any, newton_steps: int) -> Any:
+    """Pixel position of an ideal point (casadi.SX, 2)."""
     import casadi as ca
 
     model = get_model(model_name)
-    ideal = ca.vertcat(*model.plane.onto(_elements(_rotated(s.b, s.phi)), s.theta[2]))
     if model.direction == "forward":
         point = _displaced(model_name, ideal, s.theta)
     else:
@@ -117,6 +123,31 @@ def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
         for _ in range(newton_steps):
             point, _ = _newton_step(model_name, point, ideal, s.theta)
     return s.theta[:2] + ca.vertcat(*model.stretched(point[0], point[1], _elements(s.theta)))
+
+
+def _forward_columns(model_name: str, s: Symbols, newton_steps: int) -> tuple[Any, Any, Any]:
+    """Pixel position of the direction b (casadi.SX, 2), and its derivatives by theta (2, p) and by
+    phi (2, 3) at zero.
+
+    They go through the ideal point, whose two coordinates take fewer derivatives than all of theta
+    and phi.
+    """
+    import casadi as ca
+
+    ideal, point = _ideal(model_name, s.b, s.theta), ca.SX.sym("q", 2)
+    xy = _pixel(model_name, s, point, newton_steps)
+    columns = [xy, ca.jacobian(xy, s.theta), ca.jacobian(xy, point)]
+    xy, by_theta, by_point = ca.substitute(columns, [point], [ideal])
+    # A turn phi moves b by phi x b.
+    turned = ca.mtimes(ca.jacobian(ideal, s.b), -ca.skew(s.b))
+    by_theta += ca.mtimes(by_point, ca.jacobian(ideal, s.theta))
+    return xy, by_theta, ca.mtimes(by_point, turned)
+
+
+def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
+    """Pixel position of the direction ``exp([phi]x) b`` (casadi.SX, 2)."""
+    turned = _ideal(model_name, _rotated(s.b, s.phi), s.theta)
+    return _pixel(model_name, s, turned, newton_steps)
 
 
 def backward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
@@ -163,6 +194,16 @@ def bent_index(model_name: str) -> tuple[IntArray, IntArray]:
     return rows, columns
 
 
+def _second_derivatives(value: Any, variables: Any, index: tuple[IntArray, IntArray]) -> Any:
+    """Second derivatives (casadi.SX) of an index, of all axes of a value one after the other."""
+    import casadi as ca
+
+    hessians = [ca.hessian(axis, variables)[0] for axis in _elements(value)]
+    return ca.vertcat(
+        *(own[int(i), int(j)] for i, j in zip(*index, strict=True) for own in hessians)
+    )
+
+
 @lru_cache(maxsize=64)
 def forward_kernel(model_name: str, order: str) -> Kernel:
     """Kernel of the forward model at phi = 0.
@@ -175,50 +216,49 @@ def forward_kernel(model_name: str, order: str) -> Kernel:
     s = _symbols(model_name)
     p = s.theta.numel()
     bent = order == "bent"
-    xy = forward_expression(model_name, s, newton_steps=2 if bent else 1)
+    xy, by_theta, by_phi = _forward_columns(model_name, s, newton_steps=2 if bent else 1)
     outputs: list[Any] = [xy]
     shapes: list[tuple[int, ...]] = [(2,)]
     if order == "first" or bent:
         # casadi.vec is column-major, so the Jacobian (2, p) becomes rows of (p, 2).
-        outputs.append(ca.jacobian(xy, s.theta))
+        outputs.append(by_theta)
         shapes.append((p, 2))
     if order != "value":
-        outputs.append(ca.jacobian(xy, s.phi))
+        outputs.append(by_phi)
         shapes.append((3, 2))
     if bent:
-        variables = ca.vertcat(s.theta, s.phi)
-        hessians = [ca.hessian(xy[axis], variables)[0] for axis in range(2)]
-        rows, columns = bent_index(model_name)
-        entries = [
-            hessians[axis][int(i), int(j)]
-            for i, j in zip(rows, columns, strict=True)
-            for axis in range(2)
-        ]
-        outputs.append(ca.vertcat(*entries))
-        shapes.append((len(rows), 2))
+        index = bent_index(model_name)
+        xy = forward_expression(model_name, s, newton_steps=2)
+        outputs.append(_second_derivatives(xy, ca.vertcat(s.theta, s.phi), index))
+        shapes.append((len(index[0]), 2))
     outputs = [ca.substitute(ca.densify(output), s.phi, ca.SX.zeros(3)) for output in outputs]
     return build_kernel(f"forward_{model_name}_{order}", [s.theta, s.b, s.root], outputs, shapes)
 
 
 @lru_cache(maxsize=32)
-def slope_kernel(model_name: str) -> Kernel:
+def slope_kernel(model_name: str, alike: bool) -> Kernel:
     """Kernel of what a star adds to the slope of ``(e^T W e + log |A^T W A|) / 2`` over (theta, phi),
     (p + 3,), at phi = 0.
 
     e is its residual and A the derivatives of its frame's pixels by phi. The inputs end with the
-    measured pixel, W (4,) and the inverse of ``A^T W A`` (9,).
+    measured pixel, W (4,), which is the unit matrix where the axes are `alike`, and the inverse of
+    ``A^T W A`` (9,).
     """
     import casadi as ca
 
-    s, weight, inverse = _symbols(model_name), ca.SX.sym("w", 2, 2), ca.SX.sym("m", 3, 3)
-    xy = forward_expression(model_name, s, newton_steps=2)
-    columns = ca.horzcat(xy - s.pixel, ca.jacobian(xy, s.phi))
+    s, inverse = _symbols(model_name), ca.SX.sym("m", 3, 3)
+    axes = ca.SX.sym("w", 2, 2)
+    weight = ca.SX.eye(2) if alike else axes
+    xy, _, by_phi = _forward_columns(model_name, s, newton_steps=2)
+    columns = ca.horzcat(xy - s.pixel, by_phi)
     # The slope of a log determinant is that of a trace with the inverse held. What a column is
     # multiplied by is half the slope of the trace by it, because W and the inverse are symmetric.
-    held = ca.vec(weight @ columns @ ca.diagcat(1, inverse))
-    slope = ca.jtimes(ca.vec(columns), ca.vertcat(s.theta, s.phi), held, True)
-    slope = ca.substitute(ca.densify(slope), s.phi, ca.SX.zeros(3))
-    inputs = [s.theta, s.b, s.root, s.pixel, ca.vec(weight), ca.vec(inverse)]
+    held = weight @ columns @ ca.diagcat(1, inverse)
+    slope = ca.jtimes(ca.vec(columns), ca.vertcat(s.theta, s.b), ca.vec(held), True)
+    # By turns of a turned direction; from here, half a turn of the columns is less.
+    turn = ca.cross(s.b, slope[-3:]) - ca.inv_skew(held[:, 1:].T @ by_phi)
+    slope = ca.vertcat(slope[:-3], turn)
+    inputs = [s.theta, s.b, s.root, s.pixel, ca.vec(axes), ca.vec(inverse)]
     return build_kernel(f"slope_{model_name}", inputs, [slope], [(slope.numel(),)])
 
 
@@ -248,16 +288,10 @@ def backward_second_kernel(model_name: str) -> Kernel:
 
     s = _symbols(model_name)
     p = s.theta.numel()
-    direction = backward_expression(model_name, s, newton_steps=2)
-    hessians = [ca.hessian(direction[axis], s.theta)[0] for axis in range(3)]
-    rows, columns = second_index(p)
-    entries = [
-        hessians[axis][int(i), int(j)]
-        for i, j in zip(rows, columns, strict=True)
-        for axis in range(3)
-    ]
-    outputs = [direction, ca.jacobian(direction, s.theta), ca.vertcat(*entries)]
-    shapes = [(3,), (p, 3), (len(rows), 3)]
+    direction, index = backward_expression(model_name, s, newton_steps=2), second_index(p)
+    second = _second_derivatives(direction, s.theta, index)
+    outputs = [direction, ca.jacobian(direction, s.theta), second]
+    shapes = [(3,), (p, 3), (len(index[0]), 3)]
     return build_kernel(
         f"backward_second_{model_name}", [s.theta, s.pixel, s.root], outputs, shapes
     )

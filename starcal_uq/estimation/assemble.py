@@ -29,6 +29,7 @@ from starcal_uq.estimation.undetermined import (
 from starcal_uq.likelihood.compressed import CompressedLikelihood, compress, settled
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.likelihood.solvers import Normal, is_singular, reason_of
+from starcal_uq.likelihood.sums import Attitudes
 from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class Peak(NamedTuple):
     least: FloatArray  # (p,): end of the stages, px units, or, settled, the least sum of squares
     theta: FloatArray  # (p,): the estimate, px units
     normal: Normal  # At `least`
+    attitudes: Attitudes  # Near `least`
     refined: bool  # Whether positions led there
 
 
@@ -84,7 +86,7 @@ def peak_near(likelihood: MarginalLikelihood, theta: FloatArray) -> Peak | None:
         if gain**3 <= (_REST * min(before, variance)) ** 2 * variance:
             # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma.
             slope = likelihood.slope(theta, variance**0.5, found[1])
-            return Peak(theta, theta - unit @ slope, normal, True)
+            return Peak(theta, theta - unit @ slope, normal, found[1], True)
         before = gain
     return None
 
@@ -106,8 +108,8 @@ def assemble(
     theta, refined = stages[-1].theta, stages[-1].name == "refinement"
     peak = peak_near(likelihood, theta) if refined and status.ok else None
     if peak is None:
-        normal = likelihood.sums(theta, tolerance=TURN_RAD)[0].normal
-        peak = Peak(theta, theta, normal, refined)
+        sums, attitudes = likelihood.sums(theta, tolerance=TURN_RAD)
+        peak = Peak(theta, theta, sums.normal, attitudes, refined)
     return calibration_at(
         obs, nominal, likelihood, peak, status, lambda: (stages, pairs()), settings
     )
@@ -128,7 +130,7 @@ def calibration_at(
     estimate is not refined, its covariance is that of the latter. `settings` hold ``method`` and
     ``solver``. CalibrationError when there is no estimate that residuals could be taken at.
     """
-    normal, least, theta = peak.normal, peak.least, peak.theta
+    normal, least, theta, attitudes = peak.normal, peak.least, peak.theta, peak.attitudes
     if is_singular(normal.matrix):
         raise failed(likelihood, least, nominal, reason_of(status, normal.cost))
     dof = likelihood.dof - len(theta)
@@ -138,9 +140,10 @@ def calibration_at(
     names, factors = undetermined(likelihood, least, normal.matrix, sigma, nominal, status)
     wide = np.outer(factors, factors)
     efficient = scaled_inverse(normal.matrix) * sigma**2
-    e = np.empty((2, likelihood.frames.n_stars))
-    sums, attitudes = likelihood.sums(theta, e)
+    rotations = attitudes.at(theta)
+    e = likelihood.residuals(theta, rotations)
     gone = Later(way)
+    there = Later(lambda: likelihood.sums(theta)[1])
 
     def compressed() -> CompressedLikelihood:
         found = compress(likelihood, least, efficient, attitudes.at(least))
@@ -149,7 +152,7 @@ def calibration_at(
     pair_covariance = Later(lambda: gone.value[1].covariance * wide)
     return Calibration.of(
         nominal,
-        KeptFrames.of(obs, likelihood.frames, attitudes.rotations, e, nominal),
+        KeptFrames.of(obs, likelihood.frames, rotations, e, nominal),
         settings | {"distortion": nominal.distortion},
         theta=theta,
         sigma=sigma,
@@ -159,10 +162,10 @@ def calibration_at(
         covariance=efficient * wide if peak.refined else pair_covariance.value,
         stages=Later(lambda: tuple(gone.value[0])),
         undetermined=names,
-        chi2=sums.normal.cost,
+        chi2=float(np.sum(e**2)),
         information=normal.matrix / sigma**2,
-        rotation_per_theta=np.mean(attitudes.response, axis=2),
-        attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
+        rotation_per_theta=Later(lambda: np.mean(there.value.response, axis=2)),
+        attitude_noise=Later(lambda: np.mean(there.value.inverse, axis=2) * sigma**2),
         pair_theta=Later(lambda: gone.value[1].theta),
         pair_covariance=pair_covariance,
         compressed=Later(compressed),

@@ -104,8 +104,21 @@ def _triad(u: FloatArray, v: FloatArray) -> FloatArray:
     return np.stack([middle, normal, np.cross(middle, normal, axis=0)], axis=-1).transpose(1, 0, 2)
 
 
+def rough_attitudes(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray:
+    """Attitudes (K, 3, 3) at theta (p,) from two stars of each frame: the first one, and the middle
+    or the last one, whichever is farther from it; NaN where these are one.
+    """
+    first, end = frames.starts[:-1], frames.starts[1:]
+    others = np.stack([(first + end) // 2, end - 1])
+    apart = np.sum((frames.pixel[:, others] - frames.pixel[:, None, first]) ** 2, axis=0)
+    rows = np.stack([first, np.where(apart[0] > apart[1], *others)])
+    b = unproject_theta(model_name, theta, frames.pixel[:, rows.ravel()].T)
+    with np.errstate(invalid="ignore"):
+        return _two_star_attitude(b.T.reshape(3, *rows.shape), frames.r[:, rows], 0, 1)
+
+
 def _two_star_attitude(
-    b: FloatArray, r: FloatArray, first: IntArray, second: IntArray
+    b: FloatArray, r: FloatArray, first: IntArray | int, second: IntArray | int
 ) -> FloatArray:
     """Rotations (K, 3, 3) that take two catalogue directions to two measured ones, the misfit
     shared equally.

@@ -11,13 +11,22 @@ from starcal_uq.core.errors import CalibrationError, RepeatedFramesError, check_
 from starcal_uq.core.findings import clause
 from starcal_uq.core.settings import Duplicates
 from starcal_uq.core.types import IntArray
-from starcal_uq.observations.repeats import Fingerprints, repeats, shared
+from starcal_uq.observations.repeats import (
+    REACH_PX,
+    REACH_SIGMAS,
+    Fingerprints,
+    alike,
+    repeats,
+    shared,
+)
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 DUPLICATES = get_args(Duplicates)
+# Part of the detector's width over which stars tell the roll of their frame.
+_SPAN = 0.25
 # What frames have in common.
 Repeats = Enum("Repeats", "FRAMES")
 
@@ -85,13 +94,21 @@ def repeated(what: str, pairs: IntArray, n_frames: int) -> str:
     return clause(Repeats.FRAMES, what=what, first=first, later=later, more=n_frames - 1)
 
 
-def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
-    """Numbers of the frames to leave out: none where they are kept, and an error where they are
-    refused.
+def repeating_frames(calibration: Calibration, obs: Observations, duplicates: str) -> IntArray:
+    """Numbers of the frames to leave out of the observations of a calibration: none where they are
+    kept, and an error where they are refused.
     """
-    if duplicates == "keep" or calibration.fingerprints is None:
+    if duplicates == "keep" or not calibration.has_residuals:
         return np.empty(0, dtype=np.int64)
-    pairs = repeated_frames(calibration)
+    # A measurement has its attitude, too, and most frames are alone with theirs. The stars of the
+    # worst frames span a part of the detector.
+    camera, noise = calibration.camera, calibration.sigma * float(np.mean(obs.sigma_or_one))
+    reach = REACH_PX / camera.focal_px + REACH_SIGMAS * noise / (_SPAN * camera.width_px)
+    near = alike(calibration.rotations, reach)
+    if not len(near):
+        return near
+    marks = Fingerprints.of(obs, calibration.residuals_px, camera.centre_px, near)
+    pairs = calibration.frame_ids[near[repeats(marks, n_frames=obs.n_frames)]]
     later = np.unique(pairs[:, 1])
     if len(later) and duplicates == "refuse":
         raise RepeatedFramesError(

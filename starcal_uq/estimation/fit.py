@@ -29,6 +29,7 @@ from starcal_uq.estimation.assemble import (
     peak_near,
     raise_unless_good,
 )
+from starcal_uq.estimation.consensus import rough_attitudes
 from starcal_uq.estimation.kept import KeptFrames
 from starcal_uq.estimation.noise_model import Refit, Refitting, fit_noise, without_tails
 from starcal_uq.estimation.result import Calibration, check_camera
@@ -65,8 +66,8 @@ _FAR = 0.05
 _PLAIN_NOISE_PX = 1.0
 # Frames and stars of a sample that is near enough to the minimum of all.
 _SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
-# Stages that nobody reads need only lead to the next.
-_LEADING = Search(tolerance=1e-4, seen=False)
+# Stages that nobody reads need only lead to the next: to other stages, and to steps on all frames.
+_LEADING, _NEARLY = (Search(tolerance=gain, seen=False) for gain in (1e-4, 0.1))
 # Standard deviations of the last step: of the estimate from interstar angles of all frames, which
 # is then known to a thousandth of that, and of the refinement, which is left to Newton's method on
 # the expansion: a few 1e-9 of them.
@@ -117,10 +118,25 @@ def _near(likelihood: MarginalLikelihood, camera: Camera) -> Stage | None:
     where it strays.
     """
     own = MarginalLikelihood(_sample(likelihood.frames), camera.distortion)
-    stage = refinement_stage(own, camera.theta, _LEADING)
+    search = _LEADING
+    if own.frames is not likelihood.frames:
+        search = _NEARLY
+        _begin(own, camera.theta)
+    stage = refinement_stage(own, camera.theta, search)
     if _strayed(stage, camera):
         return None
+    if search is _NEARLY:
+        _begin(likelihood, stage.theta)
     return stage
+
+
+def _begin(likelihood: MarginalLikelihood, theta: FloatArray) -> None:
+    """Start attitude searches from two stars of each frame at theta (p,), where these tell all
+    attitudes: one step from there finds the best ones.
+    """
+    rotations = rough_attitudes(likelihood.frames, likelihood.model_name, theta)
+    if np.isfinite(rotations).all():
+        likelihood.use_rotations(rotations)
 
 
 def _way(

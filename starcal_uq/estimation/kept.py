@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.later import Later
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.observations.repeats import Fingerprints
 
@@ -24,7 +26,7 @@ class KeptFrames:
     frame_ids: IntArray  # (K,)
     quaternions: FloatArray  # (K, 4): scalar-last R_cam_icrs
     residuals_px: FloatArray  # (N, 2): observed minus predicted
-    fingerprints: Fingerprints | None
+    fingerprints: Fingerprints | Later[Fingerprints] | None
     per_star: bool  # Whether the stars state their noise
     data_hash: str | None
 
@@ -45,7 +47,7 @@ class KeptFrames:
             frame_ids=obs.frame_ids,
             quaternions=rotation_to_quaternion(rotations),
             residuals_px=residuals,
-            fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),
+            fingerprints=Later(partial(Fingerprints.of, obs, residuals, camera.centre_px)),
             per_star=frames.weight is not None,
             data_hash=obs.data_hash,
         )

@@ -152,8 +152,9 @@ def _residuals(
         (reader.load(part), None) if beside is None else beside.cleared(part, np.ones_like(theta))
     )
     likelihood = MarginalLikelihood(obs, camera.distortion)
-    whole, e = likelihood.frames, np.empty((2, obs.n_stars))
-    normal, attitudes = likelihood.sums(theta, e)
+    whole = likelihood.frames
+    normal, attitudes = likelihood.sums(theta)
+    e = likelihood.residuals(theta, attitudes.rotations)
     if frames is not None:
         slopes, matrix = frames.slopes.sum(axis=0), frames.matrix
         normal = replace(normal, gradient=-slopes, matrix=matrix)

@@ -107,8 +107,9 @@ class Calibration(Deferring, Shown, Traced):
     empty, `chi2` and `compressed` are those of the linearised frames, and `n_stars` and `n_frames`
     count what went by.
 
-    `stages`, `pair_theta`, `pair_covariance` and `compressed` may be computed when they are first
-    read; until then the calibration keeps the stars. Files hold them.
+    `stages`, `pair_theta`, `pair_covariance`, `compressed`, `rotation_per_theta`, `attitude_noise`
+    and `fingerprints` may be computed when they are first read; until then the calibration keeps
+    the stars. Files hold them.
 
     Attributes
     ----------

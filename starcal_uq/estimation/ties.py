@@ -22,7 +22,7 @@ from starcal_uq.estimation.stages import Search, Stage
 from starcal_uq.estimation.undetermined import coma_record, undetermined
 from starcal_uq.likelihood.compressed import settled, unit_covariance
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.sums import Attitudes, frame_sums
+from starcal_uq.likelihood.sums import Attitudes
 from starcal_uq.likelihood.ties import FittedTies, FixedMount, TiedLikelihood, Ties
 from starcal_uq.maths.linear import root_diagonal, scaled_inverse, symmetric_inverse
 
@@ -171,9 +171,7 @@ def _tied(
     """
     attitudes = likelihood.sums(theta)[1]
     turned = exp_rotation(likelihood.tied(attitudes).turns().T) @ attitudes.at(theta)
-    frames, residuals = likelihood.frames, np.empty((2, likelihood.frames.n_stars))
-    frame_sums(frames, likelihood.model_name, theta, turned, residuals)
-    return frames.in_pixels(residuals), turned, attitudes
+    return likelihood.frames.in_pixels(likelihood.residuals(theta, turned)), turned, attitudes
 
 
 class _Squares:

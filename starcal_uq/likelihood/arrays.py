@@ -61,20 +61,18 @@ def normals(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    residuals: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """As `starcal_uq.likelihood.paths.Sums.normals`."""
     p, k = len(theta), frames.n_frames
     gram, turn = np.zeros((p + 1, p + 1)), np.zeros((3, p))
     packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
-    for block in blocks(frames, model_name, theta, rotations, residuals):
+    for block in blocks(frames, model_name, theta, rotations):
         columns, turn = block.columns, block.turn
         flat = columns[3:].reshape(p + 1, -1)
         gram += flat @ flat.T
-        # The three columns of A with themselves and the ones that follow.
-        rows = [block.part.sum(np.einsum("cxn,xn->cn", columns[i:], columns[i])) for i in range(3)]
-        packed[:, block.place] = np.concatenate([row[: 3 - i] for i, row in enumerate(rows)])
-        mixed[:, :, block.place] = [row[3 - i :] for i, row in enumerate(rows)]
+        products = block.part.sum(np.einsum("ixn,cxn->icn", columns[:3], columns))
+        packed[:, block.place] = products[ROWS, COLUMNS]
+        mixed[:, :, block.place] = products[:, 3:]
     inverse, determinant = inverse_symmetric(packed)
     solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
     gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
@@ -97,7 +95,6 @@ def blocks(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    residuals: FloatArray | None = None,
 ) -> Iterator[Block]:
     """All frames in blocks, whitened; the common turn C is that of the first."""
     p, starts = len(theta), frames.starts
@@ -113,10 +110,8 @@ def blocks(
         kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
         np.subtract(part.pixel, columns[3], out=columns[3])
         part.whiten(columns)
-        if residuals is not None:
-            residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
         if first == 0:
-            turn = _common_turn(columns)
+            turn = _common_turn(columns[..., :_FEW_STARS])
         flat = columns.reshape(p + 4, -1)
         flat[4:] -= turn.T @ flat[:3]
         yield Block(slice(first, last), part, columns, turn)
@@ -195,7 +190,8 @@ def slope(
 ) -> FloatArray:
     """As `starcal_uq.likelihood.paths.Sums.slope`."""
     weight = np.linalg.inv(np.eye(2) if frames.axes is None else frames.axes).ravel()
-    kernel, total = slope_kernel(model_name), np.zeros_like(theta)
+    kernel = slope_kernel(model_name, frames.axes is None)
+    total = np.zeros_like(theta)
     for first, last in frames.parts(BLOCK_STARS):
         part, own = frames.part(first, last), slice(first, last)
         b = part.rotated(rotations[own])
@@ -244,10 +240,6 @@ def pairs(
     return cost, matrix, np.concatenate(scores, axis=1)
 
 
-# Where the entries of a symmetric matrix stand among its six unique ones.
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-
-
 def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
     """Per-frame 3 x 3 matrices ``A^T B`` of two stacks of vectors (3, N): (3, 3, K)."""
     return frames.sum(a[:, None, :] * b[None, :, :])
@@ -255,19 +247,7 @@ def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _apply(stars: FloatArray, matrix: FloatArray) -> FloatArray:
     """Every star's vectors (..., 3, N) times its frame's matrix (3, 3, N): the rows of ``A M``."""
-    x, y, z = (stars[..., i, None, :] for i in range(3))
-    product: FloatArray = x * matrix[0]
-    product += y * matrix[1]
-    product += z * matrix[2]
-    return product
-
-
-def _dot(stars: FloatArray, vector: FloatArray) -> FloatArray:
-    """Products of vectors (..., 3, N) with one (3, N)."""
-    product: FloatArray = stars[..., 0, :] * vector[0]
-    product += stars[..., 1, :] * vector[1]
-    product += stars[..., 2, :] * vector[2]
-    return product
+    return np.asarray(np.einsum("...in,ijn->...jn", stars, matrix))
 
 
 def _block_terms(
@@ -296,13 +276,9 @@ def _block_pairs(
     """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of one block."""
     p = len(db)
     cost, d_b = _block_terms(frames, turned, b)
-    scores = frames.sum(_dot(db, d_b))
-    bb = frames.sum(np.stack([b[i] * b[j] for i, j in zip(ROWS, COLUMNS, strict=True)]))
-    weighted = _apply(db, frames.spread(bb)[_SYMMETRIC])
+    scores = frames.sum(np.einsum("pin,in->pn", db, d_b))
+    weighted = _apply(db, frames.spread(_gram(frames, b, b)))
     matrix = weighted.reshape(p, -1) @ db.reshape(p, -1).T
-    cross = np.empty((3, p, 3, frames.n_frames))
-    for i in range(3):
-        cross[i] = frames.sum((b[i] * db).reshape(3 * p, -1)).reshape(p, 3, -1)
-    cross = cross.transpose(1, 0, 2, 3)
+    cross = frames.sum(b[:, None] * db[:, None])
     matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
     return cost, matrix, scores

@@ -175,11 +175,11 @@ class MarginalLikelihood:
 
     def by_frame(self, theta: FloatArray, sigma: float) -> FloatArray:
         """Log likelihood (K,) of each frame at theta (p,)."""
-        frames, e = self.frames, np.empty((2, self.frames.n_stars))
-        sums, attitudes = self.sums(theta, e)
+        frames = self.frames
+        sums, attitudes = self.sums(theta)
         if not np.isfinite(sums.cost):
             return np.full(frames.n_frames, -np.inf)
-        squares = frames.sum(np.sum(e**2, axis=0))
+        squares = frames.sum(np.sum(self.residuals(theta, attitudes.rotations) ** 2, axis=0))
         dof = 2.0 * frames.informed - 3.0
         volume = attitudes.log_determinant
         return np.asarray(-0.5 * squares / sigma**2 - dof * np.log(sigma) - 0.5 * volume)
@@ -231,6 +231,20 @@ class MarginalLikelihood:
         self.frames.whiten(h)
         self.frames.whiten(a)
         return [xy, h, a]
+
+    def residuals(self, theta: FloatArray, rotations: FloatArray) -> FloatArray:
+        """Whitened residuals (2, N), observed minus predicted, at theta (p,) and attitudes (K, 3,
+        3).
+        """
+        frames, kernel, e = self.frames, forward_kernel(self.model_name, "value"), []
+        for first, last in frames.parts(BLOCK_STARS):
+            part = frames.part(first, last)
+            b = part.rotated(rotations[first:last])
+            (xy,) = kernel(part.n_stars, theta, b, forward_root(self.model_name, theta, b))
+            e.append(part.pixel - xy)
+        found = np.concatenate(e, axis=1)
+        frames.whiten(found)
+        return found
 
     def attitudes(self, state: Profile) -> ByFrame:
         """The frames' rotations, which are eliminated."""
@@ -327,33 +341,25 @@ class MarginalLikelihood:
         return self.sums(theta)[0].normal
 
     def sums(
-        self,
-        theta: FloatArray,
-        residuals: FloatArray | None = None,
-        tolerance: float = ATTITUDE_TOLERANCE_RAD,
+        self, theta: FloatArray, tolerance: float = ATTITUDE_TOLERANCE_RAD
     ) -> tuple[NormalSums, Attitudes]:
         """Normal equations and attitudes at theta, searched from where they were last, from
         `rotations` or by QUEST.
 
-        The whitened residuals there are written into `residuals` (2, N). Attitudes are the best
-        ones to `tolerance` (rad), and the sums those of the best ones to first order.
+        Attitudes are the best ones to `tolerance` (rad), and the sums those of the best ones to
+        first order.
         """
         theta = np.asarray(theta, dtype=np.float64)
         if self._last is not None:
             sums, attitudes = self._last
-            if (
-                residuals is None
-                and sums.turn < tolerance
-                and np.array_equal(theta, attitudes.theta)
-            ):
+            if sums.turn < tolerance and np.array_equal(theta, attitudes.theta):
                 return self._last
             rotations = attitudes.at(theta)
         else:
             rotations = self.start_rotations(theta) if self._rotations is None else self._rotations
-        return settled_sums(self.frames, self.model_name, theta, rotations, residuals, tolerance)
+        return settled_sums(self.frames, self.model_name, theta, rotations, tolerance)
 
 
 def _inverse(frames: StarFrames, a: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverse (3, 3, K) of A^T A of each frame for A (3, 2, N), and its determinant (K,)."""
-    products = [np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]
-    return inverse_symmetric(frames.sum(np.stack(products)))
+    return inverse_symmetric(frames.sum(np.einsum("ixn,jxn->ijn", a, a))[ROWS, COLUMNS])

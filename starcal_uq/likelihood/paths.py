@@ -88,12 +88,11 @@ class Sums(Protocol):
         model_name: str,
         theta: FloatArray,
         rotations: FloatArray,
-        residuals: FloatArray | None,
         /,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Gram matrix (p + 1, p + 1) of e and H with the attitudes eliminated, and what
         `starcal_uq.likelihood.sums.Attitudes` holds of every frame: shift, response, inverse and
-        log determinant. Residuals are filled if given.
+        log determinant.
         """
 
     def gram(

@@ -231,7 +231,7 @@ class StudentLikelihood:
         scaled = square / scale**2
         weight = (freedom + 2.0) / (freedom + scaled)
         radial = 2.0 * weight / (freedom * scale**2 + square)
-        d = np.stack([_dot(along, e) for along in a])
+        d = np.einsum("ixn,xn->in", a, e)
         slope = frames.sum(weight * d)
         reweighted = frames.sum(
             np.stack([weight * _dot(a[i], a[j]) for i, j in zip(ROWS, COLUMNS, strict=True)])

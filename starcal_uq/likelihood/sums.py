@@ -105,18 +105,17 @@ def frame_sums(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    residuals: FloatArray | None = None,
 ) -> tuple[NormalSums, Attitudes]:
     """Normal equations of some frames, attitudes eliminated, in one pass.
 
     `rotations` (K, 3, 3) are R_cam_icrs, the best ones to first order or better, as `Attitudes.at`
-    gives them, and `residuals` (2, N) is filled with the whitened ones there. Returns what adds up
-    over parts, not finite where the model is not, and what stays with the part.
+    gives them. Returns what adds up over parts, not finite where the model is not, and what stays
+    with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
     with np.errstate(all="ignore"):
         gram, shift, response, inverse, volume = sums_for(frames).normals(
-            frames, model_name, theta, rotations, residuals
+            frames, model_name, theta, rotations
         )
         sums = NormalSums(
             cost=float(gram[0, 0]),
@@ -135,7 +134,6 @@ def settled_sums(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    residuals: FloatArray | None = None,
     tolerance: float = ATTITUDE_TOLERANCE_RAD,
 ) -> tuple[NormalSums, Attitudes]:
     """As `frame_sums`, passes repeated until every attitude is the best one; a cost of infinity
@@ -143,7 +141,7 @@ def settled_sums(
     """
     theta = np.asarray(theta, dtype=np.float64)
     for _ in range(ATTITUDE_STEPS):
-        sums, attitudes = frame_sums(frames, model_name, theta, rotations, residuals)
+        sums, attitudes = frame_sums(frames, model_name, theta, rotations)
         if sums.turn < tolerance or not np.isfinite(sums.cost):
             return sums, attitudes
         rotations = attitudes.at(theta)

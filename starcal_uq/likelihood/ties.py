@@ -230,13 +230,10 @@ class TiedLikelihood(MarginalLikelihood):
         return self.ties.around(rotations, attitudes.inverse, self.sigma)
 
     def sums(
-        self,
-        theta: FloatArray,
-        residuals: FloatArray | None = None,
-        tolerance: float = ATTITUDE_TOLERANCE_RAD,
+        self, theta: FloatArray, tolerance: float = ATTITUDE_TOLERANCE_RAD
     ) -> tuple[NormalSums, Attitudes]:
         """Normal equations with the ties, and the attitudes of each frame alone."""
-        sums, attitudes = super().sums(theta, residuals, tolerance)
+        sums, attitudes = super().sums(theta, tolerance)
         if not np.isfinite(sums.cost):
             return sums, attitudes
         tied = self.tied(attitudes)

@@ -182,6 +182,4 @@ class StarFrames:
         N).
         """
         columns = self.spread(rotations.reshape(-1, 9).T).reshape(3, 3, -1)
-        x, y, z = self.r
-        turned: FloatArray = columns[:, 0] * x + columns[:, 1] * y + columns[:, 2] * z
-        return turned
+        return np.asarray(np.einsum("ijn,jn->in", columns, self.r))

@@ -21,7 +21,7 @@ from math import comb
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval, polyvander, polyvander2d
+from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
 
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
@@ -37,7 +37,7 @@ _TRIANGLES = comb(_CORNERS, 3)
 _SHIFT = 1.5
 # Sides of triangles that look alike differ by less, in sigmas, and their places, px; of so many
 # nearest triangles the frames are compared, so that a stare of many frames takes no longer.
-_REACH_SIGMAS, _REACH_PX, _NEAREST = 8.0, 10.0 * _SHIFT, 12
+REACH_SIGMAS, REACH_PX, _NEAREST = 8.0, 10.0 * _SHIFT, 12
 # Largest r of one measurement: positions within 0.3 sigma, errors correlated by more than 0.95.
 _SAME = 0.05
 # From this factor on, residuals hold more than the noise that centroids state, and would make
@@ -89,11 +89,19 @@ class Fingerprints:
 
     @classmethod
     def of(
-        cls, obs: Observations, residuals_px: FloatArray, centre_px: tuple[float, float]
+        cls,
+        obs: Observations,
+        residuals_px: FloatArray,
+        centre_px: tuple[float, float],
+        frames: IntArray | slice = slice(None),
     ) -> Fingerprints:
-        """Take those of a table with its residuals (N, 2)."""
-        sizes, xy = obs.stars_per_frame, np.column_stack([obs.x_px, obs.y_px])
-        rows = _most_central(_length(xy - centre_px), obs.frame_starts[:-1], sizes)
+        """Take those of a table with its residuals (N, 2), of all frames or of those at some
+        places.
+        """
+        xy, sizes = obs.xy, obs.stars_per_frame[frames]
+        first = np.cumsum(sizes) - sizes
+        rows = np.repeat(obs.frame_starts[:-1][frames] - first, sizes) + np.arange(np.sum(sizes))
+        rows = rows[_most_central(_length(xy[rows] - centre_px), first, sizes)]
         frame = np.repeat(np.arange(len(sizes)), np.minimum(sizes, _MARKS))
         error = _length(_unsmooth(xy, residuals_px, rows))
         error /= np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))[frame]
@@ -178,16 +186,13 @@ def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArr
     degree = int(np.clip(most, 0, _DEGREE))
     terms = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree
     x, y = ((xy[some][used] - middle) / unit).T
-    table = polyvander2d(x, y, [degree, degree])
-    solution = np.linalg.lstsq(table[:, terms.ravel()], residuals[some][used], rcond=None)[0]
-    coefficients = np.zeros((*terms.shape, 2))
-    coefficients[terms] = solution
+    table = polyvander2d(x, y, [degree, degree])[:, terms.ravel()]
+    solution = np.linalg.lstsq(table, residuals[some][used], rcond=None)[0]
     left = residuals[rows]
     for start in range(0, len(rows), _BLOCK):
         part = slice(start, start + _BLOCK)
-        x, y = np.ascontiguousarray(((xy[rows[part]] - middle) / unit).T)
-        of_x = np.tensordot(coefficients, polyvander(y, degree), axes=(1, 1))
-        left[part] -= floats(polyval(x, of_x, tensor=False)).T
+        x, y = ((xy[rows[part]] - middle) / unit).T
+        left[part] -= polyvander2d(x, y, [degree, degree])[:, terms.ravel()] @ solution
     return left
 
 
@@ -198,9 +203,27 @@ def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
     return repeats(Fingerprints.joined([a, b]), group) - np.array([0, n], dtype=np.int64)
 
 
-def repeats(marks: Fingerprints, group: IntArray | None = None) -> IntArray:
+def alike(rotations: FloatArray, reach_rad: float) -> IntArray:
+    """Places of frames that see the stars of another in the same place: whose attitudes R_cam_icrs,
+    of (K, 3, 3), differ by less than a reach from one of the others, and a few more.
+    """
+    from scipy.spatial import cKDTree
+
+    # The boresight, and how its roll turns one axis, tell most attitudes apart.
+    entries = rotations.reshape(-1, 9)[:, [2, 6, 7, 8]] / reach_rad
+    place = np.flatnonzero(_crowded(entries.T))
+    points = entries[place]
+    near = cKDTree(points).query(points, 2, p=np.inf, distance_upper_bound=1.0)[0]
+    return np.asarray(place[np.isfinite(near[:, 1])])
+
+
+def repeats(
+    marks: Fingerprints, group: IntArray | None = None, n_frames: int | None = None
+) -> IntArray:
     """Places (n, 2), ascending in each row, of frames that are one measurement; with `group`, of
     different groups.
+
+    `n_frames`: frames of the table, where `marks` are those of some that may be repeated.
 
     A pair counts where r is at most 0.05 and its probability for independent exposures, times the
     frames of the same pointing and the number of all frames, is below 1e-6; or, where pairs are
@@ -235,14 +258,16 @@ def repeats(marks: Fingerprints, group: IntArray | None = None) -> IntArray:
     r = np.where(crowded, r / common[first], r)
     p = np.where(crowded, np.maximum(p, _probability(r, common_half[first])), p)
     p = np.minimum(1.0, p * np.maximum(1.0, partners[pairs].max(axis=1)))
-    return pairs[_judged(pairs, r, p, partners)]
+    return pairs[_judged(pairs, r, p, partners, n_frames or len(partners))]
 
 
-def _judged(pairs: IntArray, r: FloatArray, p: FloatArray, partners: IntArray) -> BoolArray:
+def _judged(
+    pairs: IntArray, r: FloatArray, p: FloatArray, partners: IntArray, n_frames: int
+) -> BoolArray:
     """Which pairs (P, 2) with these r and probabilities are one measurement."""
     from scipy.special import bdtrc
 
-    same: BoolArray = (r < _SAME) & (p * len(partners) < _FALSE_ALARM)
+    same: BoolArray = (r < _SAME) & (p * n_frames < _FALSE_ALARM)
     possible = max(int(np.count_nonzero(partners)) // 2, 1)
     unlikely = pairs[(r < _SAME) & (p < 0.01)]
     # Every frame counts once, or exposures that happen to be near many would.
@@ -291,8 +316,8 @@ def _triangles(marks: Fingerprints) -> FloatArray:
     sides = [corners[:, start], *(corners[:, other] - corners[:, start] for other in others)]
     points = np.stack(sides, axis=-1).reshape(-1, 3).view(np.float64)
     # Median length of two normal errors, so that wrong stars do not count.
-    reach = _REACH_SIGMAS * (float(np.median(marks.error_px)) / 1.1774 + 1e-4)
-    points /= np.repeat([_REACH_PX, reach, reach], 2)
+    reach = REACH_SIGMAS * (float(np.median(marks.error_px)) / 1.1774 + 1e-4)
+    points /= np.repeat([REACH_PX, reach, reach], 2)
     return points
 
 

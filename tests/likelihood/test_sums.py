@@ -73,8 +73,8 @@ def test_blocks_of_any_size_give_the_same_sums_and_residuals(monkeypatch):
     both = []
     for block in (3000, 40):
         monkeypatch.setattr(arrays, "BLOCK_STARS", block)
-        residuals = np.full((2, frames.n_stars), np.nan)
-        both.append((*frame_sums(frames, "brown", theta, rotations, residuals), residuals))
+        residuals = likelihood.residuals(theta, rotations)
+        both.append((*frame_sums(frames, "brown", theta, rotations), residuals))
     assert len(frames.parts(40)) > 2
     (whole, attitudes, left), (cut, others, same) = both
     assert cut.cost == pytest.approx(whole.cost, rel=1e-12)
@@ -186,18 +186,13 @@ def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
     rotations = likelihood.start_rotations(theta)
     plain, where = frame_sums(likelihood.frames, model, theta, rotations)
     monkeypatch.setenv(paths.SWITCH, "numba")
-    residuals = np.empty((2, likelihood.frames.n_stars))
-    fused, there = frame_sums(likelihood.frames, model, theta, rotations, residuals)
+    fused, there = frame_sums(likelihood.frames, model, theta, rotations)
     assert fused.cost == pytest.approx(plain.cost, rel=1e-12)
     difference = _scaled(fused.matrix - plain.matrix, plain.matrix)
     assert np.max(np.abs(difference)) < 1e-12
     slope = (fused.gradient - plain.gradient) / np.sqrt(np.diag(plain.matrix) * plain.cost)
     assert np.max(np.abs(slope)) < 1e-12
     assert np.allclose(there.shift, where.shift, rtol=0, atol=1e-15)
-    # Rounding of positions of a thousand px, in units of a noise of down to 0.02 px.
-    assert np.allclose(
-        residuals, _residuals(likelihood, model, theta, rotations), rtol=0, atol=1e-10
-    )
     # The compiled loops turn to the best attitudes first: 0.2 nrad that are left change a
     # derivative by 5e-12.
     best = settled_sums(likelihood.frames, model, theta, rotations)[1].at(theta)
@@ -262,16 +257,6 @@ def _compare_pairs(frames, model, theta, monkeypatch):
     assert np.max(np.abs(_scaled(fused.matrix - plain.matrix, plain.matrix))) < 1e-10
     assert np.max(np.abs(_scaled(fused_covariance - covariance, covariance))) < 1e-7
     monkeypatch.setenv(paths.SWITCH, "numba")
-
-
-def _residuals(likelihood, model, theta, rotations):
-    from starcal_uq.camera.projection import forward_kernel, forward_root
-
-    frames = likelihood.frames
-    b = frames.rotated(rotations)
-    (xy,) = forward_kernel(model, "value")(frames.n_stars, theta, b, forward_root(model, theta, b))
-    e = frames.pixel - xy
-    return e if frames.weight is None else e * frames.weight
 
 
 @needs_numba

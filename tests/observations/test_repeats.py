@@ -72,6 +72,8 @@ def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
     assert np.allclose(normalised_residuals(rest, obs), alone, atol=1e-4)
     # The old behaviour, which counts all twice: sigmas that are 0.7 times too small.
     kept = sc.calibrate(obs, sheet, duplicates="keep")
+    # All frames compared, or those alone that share their attitude with another.
+    assert np.array_equal(sc.estimation.repeated_frames(kept), caught.value.pairs)
     assert np.all(np.abs(kept.sigmas / calibrated().sigmas - np.sqrt(0.5)) < 0.06)
 
 

@@ -205,7 +205,7 @@ def screen(
     if throw and not calibration.status.ok:
         # For the error alone.
         calibration = calibrate(kept, camera, **last)
-    repeating = repeating_frames(calibration, duplicates)
+    repeating = repeating_frames(calibration, kept, duplicates)
     if len(repeating):
         rest = obs.select_frames(np.setdiff1d(obs.frame_ids, repeating))
         return screen(rest, camera, **settings, **options)

@@ -79,7 +79,7 @@ def _kernel(what: str, model: str) -> Kernel:
     if what in ("first", "bent"):
         return forward_kernel(model, what)
     if what == "slope":
-        return slope_kernel(model)
+        return slope_kernel(model, True)
     return newton_kernel(model) if what == "root" else backward_kernel(model, what == "derivatives")
 
 

@@ -59,7 +59,7 @@ def _eliminated(
     chunk, attitude, columns, slopes, n_columns, free, n_slopes, n_rows = at
     work, own = data(buffers[0]), data(buffers[1])
     gram, acc, inverse, slope = sums
-    residuals, solved, inverses, volume = of_frames
+    solved, inverses, volume = of_frames
     common, a = row(work, WORK), row(own, attitude)
     n, first, s0 = start[len(starts) - 1], start[0], start[0]
     while s0 < n:
@@ -87,10 +87,6 @@ def _eliminated(
                 of = row(own, k)
                 for i in range(m):
                     of[i] *= w[s0 + i]
-        if residuals.shape[1] > 0:
-            for i in range(m):
-                residuals[0, s0 + i] = own[i]
-                residuals[1, s0 + i] = own[STRIDE + i]
         for axis in range(2):
             call(change, shared, common, row(own, axis), m)
         for k in range(n_slopes):
@@ -150,7 +146,6 @@ def _sums(
     shared: tuple[FloatArray, FloatArray],
     at: tuple[int, ...],
     solved: FloatArray,
-    residuals: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Products and slopes of `_eliminated`, and the packed inverse and the determinant's logarithm of
     every frame.
@@ -173,7 +168,7 @@ def _sums(
         at,
         (rows(WORK + 2 * len(by_frame)), rows(n_rows + n_slopes + 2 * n_columns + 4)),
         (gram, acc, np.empty(6), slope),
-        (np.empty((2, 0)) if residuals is None else residuals, solved, inverse, volume),
+        (solved, inverse, volume),
     )
     return symmetric(gram[:n_columns, :n_columns]), slope, inverse, volume
 
@@ -183,7 +178,6 @@ def normals(
     model_name: str,
     theta: FloatArray,
     rotations: FloatArray,
-    residuals: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """As `starcal_uq.likelihood.paths.Sums.normals`."""
     p, k = len(theta), frames.n_frames
@@ -197,7 +191,6 @@ def normals(
         (-turn, np.empty((0, k))),
         (CHUNK, 2 * p + 2, 0, 0, p + 1, 0, 0, 2 * p + 8),
         solved,
-        residuals,
     )
     whole = inverse[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3, k)
     response = np.negative(solved[:, 1:])
