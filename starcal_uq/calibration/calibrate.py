@@ -19,7 +19,7 @@ from starcal_uq.core.settings import RecursiveMethod, bounded
 from starcal_uq.core.tasks import one_thread, processors
 from starcal_uq.core.types import AnyDict, Progress
 from starcal_uq.estimation.assemble import raise_unless_good
-from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
+from starcal_uq.estimation.duplicates import repeating_frames
 from starcal_uq.estimation.effects import with_effects, without_effects
 from starcal_uq.estimation.fit import fit_weighed
 from starcal_uq.estimation.partitioned import calibrate_partitions
@@ -171,7 +171,6 @@ def calibrate(
     """
     settings = (EstimationSettings() if settings is None else settings).changed(**options)
     partitioned = isinstance(obs, PartitionedObservations)
-    check_duplicates(settings.duplicates)
     settings.refuse_conflicts(scheduler=scheduler, workers=workers, partitioned=partitioned)
     calibration = _estimate(obs, camera, settings, throw, scheduler, workers, progress)
     if throw and not calibration.status.ok:

@@ -130,8 +130,8 @@ def _offset(b: FloatArray, r: FloatArray, rotations: FloatArray, sizes: IntArray
     """Chord |b - R r| of every star, (N,)."""
     total = np.zeros(b.shape[1])
     for i in range(3):
-        x, y, z = (np.repeat(rotations[:, i, j], sizes) for j in range(3))
-        total += (b[i] - x * r[0] - y * r[1] - z * r[2]) ** 2
+        row = np.repeat(rotations[:, i].T, sizes, axis=1)
+        total += (b[i] - np.einsum("jn,jn->n", row, r)) ** 2
     return np.sqrt(total)
 
 

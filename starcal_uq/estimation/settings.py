@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypedDict, get_args
 
 from starcal_uq.attitude.relative import RelativeAttitudes, load_relative_attitudes
 from starcal_uq.core.conflicts import refuse_conflicts
-from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.errors import CalibrationError, check_known
 from starcal_uq.core.settings import (
     WEIGHING,
     Duplicates,
@@ -31,6 +31,7 @@ _WORDS = {
     "method": METHODS,
     "solver": get_args(Solver),
     "mount": get_args(MountKind),
+    "duplicates": get_args(Duplicates),
 }
 # Keywords of earlier versions, and the effects that they are now.
 _EARLIER = {"likelihood": "tails", "noise": "noise", "star_errors": "star"}
@@ -85,11 +86,7 @@ class EstimationSettings:
 
     def __post_init__(self) -> None:
         for name, words in _WORDS.items():
-            value = getattr(self, name)
-            if isinstance(value, str) and value not in words:
-                raise CalibrationError(
-                    f"{name} {value!r} is unknown: use one of {', '.join(words)}."
-                )
+            check_known(name, getattr(self, name), words, CalibrationError)
         parse_dof(self.dof, CalibrationError)
         if self.dof is not None and not self.tails:
             raise CalibrationError(

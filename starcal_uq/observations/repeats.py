@@ -101,9 +101,9 @@ class Fingerprints:
         xy, sizes = obs.xy, obs.stars_per_frame[frames]
         first = np.cumsum(sizes) - sizes
         rows = np.repeat(obs.frame_starts[:-1][frames] - first, sizes) + np.arange(np.sum(sizes))
-        rows = rows[_most_central(_length(xy[rows] - centre_px), first, sizes)]
+        rows = rows[_most_central(np.linalg.norm(xy[rows] - centre_px, axis=1), first, sizes)]
         frame = np.repeat(np.arange(len(sizes)), np.minimum(sizes, _MARKS))
-        error = _length(_unsmooth(xy, residuals_px, rows))
+        error = np.linalg.norm(_unsmooth(xy, residuals_px, rows), axis=1)
         error /= np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))[frame]
         stated = stated_noise(obs)
         if stated is not None:
@@ -156,11 +156,6 @@ def _inflation(ratio: FloatArray, frame: IntArray) -> FloatArray:
     return np.where(factor > _INFLATED, factor, 1.0)[frame]
 
 
-def _length(vectors: FloatArray) -> FloatArray:
-    """Lengths (n,) of vectors (n, 2), in a third of the time that `numpy.hypot` takes."""
-    return floats(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))
-
-
 def _most_central(distance: FloatArray, starts: IntArray, sizes: IntArray) -> IntArray:
     """Rows of at most 12 stars of each frame, nearest first, frame by frame."""
     # One number, of the frame and a fraction for the distance, sorts in a tenth of the time of two.
@@ -204,8 +199,8 @@ def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
 
 
 def alike(rotations: FloatArray, reach_rad: float) -> IntArray:
-    """Places of frames that see the stars of another in the same place: whose attitudes R_cam_icrs,
-    of (K, 3, 3), differ by less than a reach from one of the others, and a few more.
+    """Places of frames whose attitude R_cam_icrs, of (K, 3, 3), may be within a reach of that of
+    another.
     """
     from scipy.spatial import cKDTree
 

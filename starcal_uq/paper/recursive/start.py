@@ -148,10 +148,7 @@ class RecursionOptions:
     def check(self, method: str) -> None:
         """Refuse what makes no sense, by a `CalibrationError` with the remedy."""
         check_known("pair_covariance", self.pair_covariance, PAIR_COVARIANCES, CalibrationError)
-        if self.parameters not in ("optics", "all"):
-            raise CalibrationError(
-                f"parameters {self.parameters!r} is unknown: use one of optics, all."
-            )
+        check_known("parameters", self.parameters, ("optics", "all"), CalibrationError)
         if not 0.0 < self.forgetting <= 1.0:
             raise CalibrationError(
                 f"forgetting is {self.forgetting}: use a number above 0 and up to 1."
