@@ -202,11 +202,13 @@ def alike(rotations: FloatArray, reach_rad: float) -> IntArray:
     """Places of frames whose attitude R_cam_icrs, of (K, 3, 3), may be within a reach of that of
     another.
     """
-    from scipy.spatial import cKDTree
-
     # The boresight, and how its roll turns one axis, tell most attitudes apart.
     entries = rotations.reshape(-1, 9)[:, [2, 6, 7, 8]] / reach_rad
     place = np.flatnonzero(_crowded(entries.T))
+    if not len(place):
+        return place
+    from scipy.spatial import cKDTree
+
     points = entries[place]
     near = cKDTree(points).query(points, 2, p=np.inf, distance_upper_bound=1.0)[0]
     return np.asarray(place[np.isfinite(near[:, 1])])
