@@ -11,7 +11,8 @@ import io
 import re
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, cast
@@ -464,19 +465,14 @@ def svg_bytes(figure: Figure) -> bytes:
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    canvas, resolution, buffer = figure.canvas, figure.dpi, io.StringIO()
-    try:
-        figure.dpi = DPI
-        with (
-            rc_context({"svg.hashsalt": "starcal_uq", "svg.fonttype": "path"}),
-            single_ticks(figure),
-        ):
-            metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-            svg: Any = FigureCanvasSVG(figure)
-            svg.print_svg(buffer, metadata=metadata)
-    finally:
-        figure.dpi = resolution
-        figure.set_canvas(canvas)
+    buffer = io.StringIO()
+    with (
+        _resolved(figure, DPI),
+        rc_context({"svg.hashsalt": "starcal_uq", "svg.fonttype": "path"}),
+        single_ticks(figure),
+    ):
+        svg: Any = FigureCanvasSVG(figure)
+        svg.print_svg(buffer, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
     text = buffer.getvalue()
     for pattern, short in _SHORTER:
         text = pattern.sub(short, text)
@@ -487,13 +483,20 @@ def painted(figure: Figure, dpi: int) -> NDArray[np.uint8]:
     """The figure's pixels (height, width, 3), drawn once, where `Figure.savefig` draws twice."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    canvas, resolution = figure.canvas, figure.dpi
-    try:
-        figure.dpi = dpi
+    with _resolved(figure, dpi):
         agg: Any = FigureCanvasAgg(figure)
         agg.draw()
         # Opaque, as all figures here are.
         return np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])
+
+
+@contextmanager
+def _resolved(figure: Figure, dpi: int) -> Iterator[None]:
+    """Draw a figure at a resolution, on canvases that leave it with the block."""
+    canvas, resolution = figure.canvas, figure.dpi
+    figure.dpi = dpi
+    try:
+        yield
     finally:
         figure.dpi = resolution
         figure.set_canvas(canvas)

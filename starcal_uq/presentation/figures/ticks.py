@@ -74,8 +74,7 @@ def _marks() -> Any:
             """Each tick's label in turn."""
             for text in filter(Artist.get_visible, (self.tick.label1, self.tick.label2)):
                 for place, word in zip(self.at, self.words, strict=True):
-                    text.set_text(word)
-                    (text.set_x if self.across else text.set_y)(place)
+                    text.set(text=word, **{self.axis.axis_name: place})
                     yield text
 
         def extents(self, renderer: Any) -> FloatArray:
@@ -88,9 +87,8 @@ def _marks() -> Any:
                 self.beyond = np.subtract(Bbox.union([panel, *boxes]).extents, panel.extents)
             ends: FloatArray = panel.extents + self.beyond
             side = ("left", "bottom", "right", "top").index(axis.get_label_position())
-            pad = axis.labelpad * axis.axes.figure.dpi / 72.0
-            place = axis.label.set_y if self.across else axis.label.set_x
-            place(ends[side] + (pad if side > 1 else -pad))
+            pad = (side // 2 * 2 - 1) * axis.labelpad * axis.axes.figure.dpi / 72.0
+            axis.label.set(**{"xy"[side % 2]: ends[side] + pad})
             return ends
 
         def draw(self, renderer: Any) -> None:
@@ -111,13 +109,12 @@ def _marks() -> Any:
         def get_tightbbox(self, renderer: Any = None) -> Bbox:
             self.beyond = None
             x0, y0, x1, y1 = self.extents(renderer)
-            if self.axis.label.get_text():
-                label = self.axis.label.get_window_extent(renderer)
-                # No panel makes room for a label that is longer.
-                if self.across:
-                    y0, y1 = min(y0, label.y0), max(y1, label.y1)
-                else:
-                    x0, x1 = min(x0, label.x0), max(x1, label.x1)
-            return Bbox.from_extents(x0, y0, x1, y1)
+            if not self.axis.label.get_text():
+                return Bbox.from_extents(x0, y0, x1, y1)
+            label = self.axis.label.get_window_extent(renderer)
+            # No panel makes room for a label that is longer.
+            if self.across:
+                return Bbox.from_extents(x0, min(y0, label.y0), x1, max(y1, label.y1))
+            return Bbox.from_extents(min(x0, label.x0), y0, max(x1, label.x1), y1)
 
     return Marks
