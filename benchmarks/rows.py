@@ -126,7 +126,12 @@ def estimates() -> list[Row]:
                 Contestant(BUNDLE, "bundles:schur", how="NumPy"),
                 Contestant("SciPy sparse bundle", "bundles:sparse", how="SciPy"),
                 Contestant("SciPy least_squares, sparse", "bundles:least_squares", how="SciPy"),
-                Contestant("mrcal", "bundle_mrcal:bundle", "system", how="C"),
+                # More than four minutes a call at 100,000 frames.
+                *(
+                    [Contestant("mrcal", "bundle_mrcal:bundle", "system", how="C")]
+                    if frames <= 10_000
+                    else []
+                ),
             ),
             same=same_estimate(),
             frames=frames,

@@ -12,7 +12,7 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import jinja2
 import numpy as np
@@ -28,6 +28,7 @@ from starcal_uq.calibration.screening.result import Rejections
 from starcal_uq.comparison.compare import Differs
 from starcal_uq.comparison.covariance import Basis
 from starcal_uq.core import status
+from starcal_uq.core.settings import Scope
 from starcal_uq.diagnostics.verdict.limits import Limit
 from starcal_uq.diagnostics.verdict.remedies import Refusal
 from starcal_uq.estimation.duplicates import Repeats
@@ -38,6 +39,8 @@ from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.inference.priors import Stated
 from starcal_uq.likelihood.noise_model import Noise
 from starcal_uq.pipeline.images import Told
+from starcal_uq.presentation.figures import planning
+from starcal_uq.presentation.words import sentences
 from starcal_uq.presentation.words.sentences import CompiledTemplates, templates, told
 from starcal_uq.sky.apparent import Horizon
 
@@ -51,6 +54,11 @@ KINDS = {
     *(Basis, Differs, Apart, Rejections, Noise, Remark, Floor, Steps, Told, Repeats, Stated),
     *(Horizon, Refused),
 }
+
+
+def test_figures_and_sentences_name_the_parts_of_an_attitude_error_alike() -> None:
+    assert set(sentences.SCOPE_NAMES) == set(get_args(Scope))
+    assert planning.SCOPE_NAMES is sentences.SCOPE_NAMES
 
 
 def made(tree: ast.AST) -> Iterator[ast.Call]:

@@ -21,6 +21,7 @@ from starcal_uq.presentation.figures.sweeps import (
     target_words,
 )
 from starcal_uq.presentation.words.numbers import need_words
+from starcal_uq.presentation.words.sentences import SCOPE_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,12 +31,6 @@ if TYPE_CHECKING:
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.planned import Plan
 
-_SCOPES = {
-    "common": "common rotation",
-    "rest": "rest",
-    "calibration": "calibration",
-    "total": "calibration and centroid noise",
-}
 _LINE: AnyDict = {"markersize": 4, "linewidth": 1.5}
 _COLOURS = (style.ORANGE, style.GREEN, style.BLUE, style.PURPLE)
 # Points of a curve that still have markers.
@@ -125,7 +120,7 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
             _diamond(ax, needed, plan.target_arcsec, markersize=6, zorder=4)
         target_words(ax, plan.target_arcsec, words)
     _plain_ticks(ax)
-    title = f"Two-axis error at {confidence_text(plan.confidence)}, {_SCOPES[plan.scope]}"
+    title = f"Two-axis error at {confidence_text(plan.confidence)}, {SCOPE_NAMES[plan.scope]}"
     style.label(ax, title, "frames", "error across the boresight [arcsec]")
 
 
@@ -200,7 +195,7 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
         style.label(ax, "", _SWEEPS[name])
         if target is not None:
             target_line(ax, target)
-    at, scope = confidence_text(plan.confidence), _SCOPES[plan.scope]
+    at, scope = confidence_text(plan.confidence), SCOPE_NAMES[plan.scope]
     title, words = f"Frames for {plan.target_arcsec or 0:g} arcsec at {at}, {scope}", "frames"
     if not of_frames:
         after = count(int(plan.sweeps["n_frames"].iloc[0]))
@@ -240,7 +235,9 @@ def plot_frame_choice(choice: FrameChoice) -> Figure:
     if choice.criterion == "D":
         style.label(right, "Gain", "frames", "sigma per parameter, of the choice's")
     else:
-        style.label(right, f"Gain: {_SCOPES[choice.scope]}", "frames", "1 sigma per axis [arcsec]")
+        style.label(
+            right, f"Gain: {SCOPE_NAMES[choice.scope]}", "frames", "1 sigma per axis [arcsec]"
+        )
     return figure
 
 

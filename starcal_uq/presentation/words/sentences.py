@@ -55,7 +55,7 @@ LITTLE = 1.2
 SCOPE_NAMES = {
     "common": "common rotation",
     "rest": "rest of the calibration",
-    "calibration": "calibration (common rotation and rest)",
+    "calibration": "calibration",
     "total": "calibration and centroid noise",
 }
 
