@@ -162,16 +162,19 @@ def star_test(obs: Observations, cal: Calibration, of_frames: int = 0) -> StarTe
     unit = np.outer(normals.scale, normals.scale)
     s = len(normals.scores)
     pull = normals.response.reshape(-1, len(unit)) @ inverse
-    pulled = pull.T @ pull * found.tau2
+    share = obs.n_frames / (of_frames or obs.n_frames)
+    # What errors of the stars do to single images averages out as noise does; what two images of a
+    # star have in common is the same in any number of frames.
+    alone = inverse @ normals.of_images @ inverse
+    pulled, coherent = (pull.T @ pull - less * alone for less in (0.0, 1.0 - share))
     noise = normals.squares / normals.dof
     own = own_noise(obs, noise, found.tau2)
     steps = normals.left_out()
     spread = steps - steps.mean(axis=0)
     scores = normals.scores @ inverse
-    included, share = _included(cal), obs.n_frames / (of_frames or obs.n_frames)
-    # Errors of the stars are the same in any number of frames; the noise is not.
-    model = inverse * own * share + pulled
-    growth = np.sqrt(np.diag(model) / np.diag(inverse * own + pulled))
+    included = _included(cal)
+    model = inverse * own * share + coherent * found.tau2
+    growth = np.sqrt(np.diag(model) / np.diag(inverse * own + pulled * found.tau2))
     clustered = unit * np.outer(growth, growth)
     return StarTest(
         parameter_names=cal.parameter_names,

@@ -198,6 +198,7 @@ class StarNormals:
     slopes: FloatArray
     # (S, 2, p): change of the slope by one px of offset of the star along each of its axes
     response: FloatArray
+    of_images: FloatArray  # (p, p): products of the same of every image, summed up
     dof: int  # Degrees of freedom after the fit
 
     @classmethod
@@ -209,7 +210,7 @@ class StarNormals:
         start, gram = cal.rotations, np.zeros((p + 1, p + 1))
         s = term.n_groups
         scores, slopes, matrices = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, p, p))
-        response = np.zeros((s, 2, p))
+        response, of_images = np.zeros((s, 2, p)), np.zeros((p, p))
         for part, state, columns, rows in likelihood.linearised(
             cal.theta, cal.sigmas, start, _STARS_AT_ONCE
         ):
@@ -217,7 +218,9 @@ class StarNormals:
             gram += flat @ flat.T
             z = term.columns(part, state, rows)
             add_by_group(scores, np.sum(h * state.e, axis=1), stars)
-            add_by_group(response, np.einsum("ixn,pxn->ipn", z, h), stars)
+            own = np.einsum("ixn,pxn->ipn", z, h)
+            add_by_group(response, own, stars)
+            of_images += np.tensordot(own, own, axes=((0, 2), (0, 2)))
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
             # hidden.
             a = part.attitudes(state).orthonormal
@@ -235,6 +238,7 @@ class StarNormals:
             matrices=matrices * np.outer(unit, unit),
             slopes=slopes * unit,
             response=response * unit,
+            of_images=of_images * np.outer(unit, unit),
             dof=likelihood.dof - p,
         )
 
