@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _STARS_AT_ONCE = 1_000_000
 # Stars whose columns are held at once.
-_COLUMNS_AT_ONCE = 10_000
+_COLUMNS_AT_ONCE = 40_000
 
 
 @dataclass(frozen=True, eq=False)
