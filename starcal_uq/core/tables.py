@@ -72,13 +72,14 @@ def read_cells(
     from pyarrow.parquet import ParquetFile
 
     with opened(path, data) as file:
-        names = list(file.schema_arrow.names)
+        schema = file.schema_arrow
+        names = list(schema.names)
         own = [name for name in names if wanted is None or name in wanted]
         # Texts are codes in the file, and stay so.
-        texts = [name for name in own if file.schema_arrow.field(name).type == pa.string()]
+        texts = [name for name in own if schema.field(name).type == pa.string()]
         with ParquetFile(pa.BufferReader(data), read_dictionary=texts, pre_buffer=False) as again:
             table = again.read(columns=own, use_threads=False)
-        meta = own_meta(file.schema_arrow, key)
+        meta = own_meta(schema, key)
     rows = np.arange(table.num_rows)
     if chosen is not None:
         # Before anything becomes Python's: texts of all rows would take longer than the rest.
@@ -110,11 +111,7 @@ def write_parquet(
 
     table = pa.table(
         {
-            name: pa.DictionaryArray.from_arrays(
-                values.codes, values.names.tolist()
-            ).dictionary_decode()
-            if isinstance(values, Texts)
-            else values
+            name: pa.array(values.names).take(values.codes) if isinstance(values, Texts) else values
             for name, values in columns.items()
         }
     )

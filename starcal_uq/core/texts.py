@@ -74,7 +74,7 @@ class Texts(_ARRAY):  # type: ignore[misc]
         """Several columns, one after the other."""
         names = np.unique(np.concatenate([part.names for part in parts]))
         places = [np.searchsorted(names, part.names)[part.codes] for part in parts]
-        return cls.placed(np.concatenate(places), names)
+        return cls(np.concatenate(places).astype(np.int32), names)
 
     def map(self, function: Callable[[str], str]) -> Texts:
         """The column with each text replaced by what a function makes of it."""

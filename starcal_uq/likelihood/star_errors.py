@@ -8,7 +8,6 @@ per axis is ``tau^2`` and what the catalogue states on top.
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.terms import Term
-from starcal_uq.observations.rows import locked
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -29,22 +27,10 @@ _SAME_PX = 0.3
 _SAME_NAME_PX, _SAME_NAME_RAD = 5.0, 6e-4
 
 
-# Numbers of the stars of tables, and the focal lengths that they were found with.
-_KNOWN: WeakKeyDictionary[Observations, tuple[float, IntArray]] = WeakKeyDictionary()
-
-
 def star_numbers(obs: Observations, focal_px: float) -> IntArray:
     """Star of every image (N,), numbered from 0 by direction, or by name where all stars have
-    one; those that were found last are kept with the table.
+    one.
     """
-    focal, numbers = _KNOWN.get(obs, (None, None))
-    if numbers is None or focal != focal_px:
-        numbers = locked(_numbered(obs, focal_px))
-        _KNOWN[obs] = focal_px, numbers
-    return numbers
-
-
-def _numbered(obs: Observations, focal_px: float) -> IntArray:
     named = bool(np.all(obs.named != ""))
     tolerance = max(_SAME_NAME_PX / focal_px, _SAME_NAME_RAD) if named else _SAME_PX / focal_px
     place = _linked(obs.directions_icrs, tolerance)

@@ -248,10 +248,11 @@ def convert_columns(
         if kind == "number":
             if raw.decimal_comma:
                 cells = [cell.replace(",", ".") for cell in cells]
-            values, bad = (cells, bad) if typed else parse_numbers(name, cells)
+            if not typed:
+                cells, bad = parse_numbers(name, cells)
             # Whoever states a factor has left the unit of the file behind.
             unit = raw.units.get(own, "") if factor == 1.0 else ""
-            values = _to_unit(path, name, values, unit)
+            values = _to_unit(path, name, cells, unit)
             columns[name] = values if as_it_is else values * factor + shift
         elif kind == "whole" and typed and cells.dtype.kind in "iu":
             columns[name] = cells

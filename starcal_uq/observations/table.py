@@ -175,7 +175,8 @@ class Observations(FrameRows, Sourced, Shown):
             digest.update(f"{name}:{len(values)};".encode())
             if isinstance(values, Texts):
                 # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
-                digest.update("".join(values.map(lambda text: f"{len(text)}:{text}")).encode())
+                pieces = [f"{len(text)}:{text}".encode() for text in values.names.tolist()]
+                digest.update(b"".join(np.array(pieces, dtype=object)[values.codes]))
             else:
                 # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
                 values = values + values.dtype.type(0)

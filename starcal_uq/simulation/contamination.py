@@ -114,8 +114,7 @@ def contaminate(
     for name, values in stars.named(replacements).items():
         column = getattr(obs, name)
         if column is not None:
-            # Names may be longer than the table's.
-            changed = column.astype(np.result_type(column, values))
+            changed = column.astype(object)
             changed[rows] = values
             changes[name] = changed
     return Contaminated(replace(obs, **changes), wrong)

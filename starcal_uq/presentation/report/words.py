@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from starcal_uq.core.texts import Texts
 from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.observed import refraction
 from starcal_uq.presentation.html import card, listed
@@ -30,7 +29,7 @@ def run_html(results: Results) -> str:
 def data_sentence(results: Results) -> str:
     """What the result rests on, in one or two sentences."""
     obs, cal = results.observations, results.calibration
-    n_different = 0 if obs.star_id is None else len(Texts.of(obs.star_id).names)
+    n_different = 0 if obs.star_id is None else len(obs.named.names)
     return told("data", results, n_different=n_different, refraction=refraction(obs, cal))
 
 
