@@ -120,9 +120,9 @@ def quads_of(neighbours: IntArray) -> IntArray:
     kind = "<u2" if quads.max(initial=0) < 1 << 16 else "<u4"
     keys = quads.take(_IN_KEY, axis=1).astype(kind).view("<u8")
     keys = np.sort(keys, axis=0) if keys.shape[1] == 1 else keys[np.lexsort(keys.T)]
-    new = np.ones(len(keys), dtype=np.bool_)
-    new[1:] = np.any(keys[1:] != keys[:-1], axis=1)
-    return keys[new].view(kind).take(_IN_KEY, axis=1).astype(np.int64)
+    new = np.append(True, np.any(keys[1:] != keys[:-1], axis=1))[: len(keys)]
+    different: IntArray = keys[new].view(kind).take(_IN_KEY, axis=1).astype(np.int64)
+    return different
 
 
 # Of four points, the ends of each side and the other two.
@@ -158,10 +158,11 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
 
 
 # Codes are kept by cells of this width, so that what is like a code lies in one or two of them along
-# each axis. The number of a cell has a byte for each axis.
+# each axis. The number of a cell has a byte for each axis, to which the next one along some axes
+# adds `_NEXT`.
 _CELL = 4.0 * _CODE_TOLERANCE
 _BYTES = 1 << np.array([24, 16, 8, 0])
-_ONE_OR_TWO = np.array(list(product((0, 1), repeat=4)))
+_NEXT = np.array(list(product((0, 1), repeat=4))) @ _BYTES
 # Neighbouring cells are spread over the table of a level by this factor.
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 
@@ -170,11 +171,8 @@ def _cells_near(codes: FloatArray) -> tuple[IntArray, IntArray]:
     """Cells that hold what is like each of some codes (q, 4): the rows of codes, and cells."""
     low = np.floor((codes - _CODE_TOLERANCE) / _CELL).astype(np.int64)
     more = np.floor((codes + _CODE_TOLERANCE) / _CELL).astype(np.int64) - low
-    # The bits of a row's number are the row of `_ONE_OR_TWO`.
-    row = np.arange(len(_ONE_OR_TWO))
-    used = ((more @ np.array([8, 4, 2, 1]))[:, None] & row) == row
-    cells = (low @ _BYTES)[:, None] + _ONE_OR_TWO @ _BYTES
-    return np.nonzero(used)[0], cells[used]
+    used = ((more @ _BYTES)[:, None] & _NEXT) == _NEXT
+    return np.nonzero(used)[0], ((low @ _BYTES)[:, None] + _NEXT)[used]
 
 
 def _places(cells: IntArray, n: int) -> IntArray:
@@ -500,8 +498,8 @@ def _frame_quads(u: FloatArray) -> IntArray:
         parts.append(quads_of(cKDTree(u[:m]).query(u[:m], min(_FRAME_NEAREST + 1, m))[1]))
     quads = np.concatenate(parts)
     # Rows as numbers of four digits are sorted in a tenth of the time.
-    digits = _BRIGHTEST[-1] ** np.arange(3, -1, -1)
-    return quads[np.unique(quads @ digits, return_index=True)[1]]
+    number = quads @ _BRIGHTEST[-1] ** np.arange(3, -1, -1)
+    return quads[np.unique(number, return_index=True)[1]]
 
 
 @dataclass(frozen=True)

@@ -141,10 +141,6 @@ def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
     return floats(np.einsum("avn,bvn->abn", y, np.einsum("vun,bun->bvn", image, x)))
 
 
-def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
-    return floats(py[:, None] * px)
-
-
 def fit_stars(
     stamps: Stamps,
     x: FloatArray,
@@ -266,7 +262,7 @@ def _weighted(
     stamps: Stamps, flux: FloatArray, px: FloatArray, py: FloatArray, others: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """What the model leaves over, and the weights that it implies, (m, m, n) each."""
-    bright = _gaussian(px, flux * py)
+    bright: FloatArray = px * (flux * py)[:, None]
     if others is not None:
         bright += others
     rest = stamps.counts - bright
@@ -322,7 +318,7 @@ def _of_others(stamps: Stamps, state: FloatArray, pairs: IntArray, stars: IntArr
         du, dv = stamps.x0[there] - stamps.x0[here], stamps.y0[there] - stamps.y0[here]
         px, py = _profiles(stamps, u + du, v + dv, np.exp(log_sigma), 0)
         first = np.flatnonzero(np.diff(here, prepend=-1))
-        light = _gaussian(px[0], np.maximum(flux, 0.0) * py[0])
+        light = px[0] * (np.maximum(flux, 0.0) * py[0])[:, None]
         others[..., np.searchsorted(stars, here[first])] = np.add.reduceat(light, first, axis=2)
     return others
 
