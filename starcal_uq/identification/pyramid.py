@@ -256,18 +256,14 @@ def _supported(
     i, j, k = corner = list(triangle)
     r = pairs.directions[candidates]
     perimeter = angle[i, j] + angle[j, k] + angle[k, i]
-    measured = (
-        angle_between(r[:, 0], r[:, 1])
-        + angle_between(r[:, 1], r[:, 2])
-        + angle_between(r[:, 2], r[:, 0])
-    ) / perimeter
+    measured = sum(angle_between(r[:, m], r[:, (m + 1) % 3]) for m in range(3)) / perimeter
     scale = 1.0 / measured
     b = unit_directions(u, geometry.focal_px * scale)
     # Roll from the longest side.
     p, q = max(((0, 1), (1, 2), (2, 0)), key=lambda side: length[corner[side[0]], corner[side[1]]])
     camera_axes = axes_of(b[:, corner], p, q)
     rotation = camera_axes.transpose(0, 2, 1) @ axes_of(r, p, q)
-    others = np.array([m for m in range(len(u)) if m not in corner])
+    others = np.delete(np.arange(len(u)), corner)
     sky = b[:, others] @ rotation
     span = length[corner[p], corner[q]]
     reach = np.hypot(*(u[others] - u[corner].mean(axis=0)).T)

@@ -473,8 +473,7 @@ def window_moments(
 
 def _second_moments(sums: FloatArray) -> FloatArray:
     """Sums of uu, uv and vv as matrices (n, 2, 2), from sums (power of v, power of u, n)."""
-    rows = [sums[0, 2], sums[1, 1], sums[1, 1], sums[2, 0]]
-    return np.stack(rows, axis=1).reshape(-1, 2, 2)
+    return floats(sums[[0, 1, 1, 2], [2, 1, 1, 0]].T.reshape(-1, 2, 2))
 
 
 def _window_gradient(
