@@ -31,7 +31,6 @@ CHUNK = 128
 # Rows of the buffer `work`: the direction, or the pixel; the root; the target, then the pixel.
 WORK = 8
 _NEWTON_STEPS = 60
-_NONE = np.empty(0)
 
 # Sums in another order, fused products, shared reciprocals: nothing that changes what becomes of
 # NaN and infinity.
@@ -241,11 +240,6 @@ def given(array: Any) -> Any:
 
 def columns_of(frames: StarFrames) -> Any:
     return tuple(map(given, (*frames.pixel, *frames.r)))
-
-
-def weighted(frames: StarFrames, rotations: FloatArray, power: int) -> tuple[Any, Any, Any, Any]:
-    weight = _NONE if frames.weight is None else frames.weight**power
-    return columns_of(frames), given(weight), given(frames.starts), given(rotations)
 
 
 def symmetric(upper: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from starcal_uq.likelihood.loops.common import (
     CHUNK,
     VERSION,
     WORK,
+    columns_of,
     compiled,
     fill_directions,
     given,
@@ -22,7 +23,6 @@ from starcal_uq.likelihood.loops.common import (
     rows,
     star_function,
     symmetric,
-    weighted,
 )
 from starcal_uq.likelihood.loops.unrolled import STRIDE, block_products, call, data, row
 from starcal_uq.observations.frames import StarFrames
@@ -152,6 +152,9 @@ def _sums(
     """
     k, (numbers, by_frame), (kernel, change) = frames.n_frames, shared, functions
     *_, n_columns, free, n_slopes, n_rows = at
+    weight = np.empty(0) if frames.weight is None else frames.weight
+    if kernel == "slope":
+        weight = weight**2
     # Groups of three fill up the last one.
     gram, acc = np.zeros((n_columns + 2, n_columns + 2)), np.zeros((3, n_columns + 5 - free))
     slope, inverse, volume = np.zeros(n_slopes // 2), np.empty((6, k)), np.empty(k)
@@ -163,7 +166,7 @@ def _sums(
             star_function(change, model_name),
         ),
         (given(theta), given(numbers.ravel())),
-        weighted(frames, rotations, 2 if kernel == "slope" else 1),
+        (columns_of(frames), given(weight), given(frames.starts), given(rotations)),
         given(by_frame),
         at,
         (rows(WORK + 2 * len(by_frame)), rows(n_rows + n_slopes + 2 * n_columns + 4)),
