@@ -153,8 +153,8 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     order[2:] = np.where(swap, order[:1:-1], order[2:])
     quads = np.take_along_axis(quads, order.T, axis=1)
     codes = np.ascontiguousarray(c.T).view(np.float64)
-    a, b = (directions.take(ends, axis=0) for ends in quads.T[:2])
-    return codes, quads, angle_between(a, b)
+    ends = (directions.take(end, axis=0) for end in quads.T[:2])
+    return codes, quads, angle_between(*ends)
 
 
 # Codes are kept by cells of this width, so that what is like a code lies in one or two of them along

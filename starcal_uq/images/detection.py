@@ -18,6 +18,7 @@ from starcal_uq.images.fits import (
     Stamps,
     StarFit,
     cut_stamps,
+    disturbed,
     explained,
     fit_stars,
     near_pairs,
@@ -319,9 +320,7 @@ def _columns(
 
     margin = np.minimum.reduce([x, width - 1 - x, y, height - 1 - y]) + 0.5
     blended = np.zeros(len(order), dtype=np.bool_)
-    near = near_pairs(x, y, 6.0 * sigma)
-    # A star a hundred times fainter moves its neighbour by less than the noise.
-    blended[near[flux[near[:, 1]] > 0.01 * flux[near[:, 0]], 0]] = True
+    blended[disturbed(x, y, flux, 6.0 * sigma)] = True
     return {
         "x_px": x,
         "y_px": y,

@@ -50,9 +50,10 @@ class Stamps:
 
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
-        names = ("x0", "y0", "counts", "good", "fine", "variance")
-        # Indexing would put the stars first in memory.
-        changes: AnyDict = {name: getattr(self, name).take(chosen, axis=-1) for name in names}
+        changes: AnyDict = {}
+        for name in ("x0", "y0", "counts", "good", "fine", "variance"):
+            # Indexing would put the stars first in memory.
+            changes[name] = getattr(self, name).take(chosen, axis=-1)
         return replace(self, **changes)
 
     def whole_within(self, x: FloatArray, y: FloatArray, radius: FloatArray) -> BoolArray:
@@ -358,6 +359,15 @@ def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
     return both[np.argsort(both[:, 0], kind="stable")]
 
 
+def disturbed(x: FloatArray, y: FloatArray, flux: FloatArray, reach: float) -> IntArray:
+    """Stars with a neighbour closer than `reach`; one a hundred times fainter moves them by less
+    than the noise.
+    """
+    near = near_pairs(x, y, reach)
+    moved: IntArray = near[flux[near[:, 1]] > 0.01 * flux[near[:, 0]], 0]
+    return moved
+
+
 # Wide enough to bridge the pixels of an undersampled image.
 _WINDOW_SIGMA_PX = 1.5
 # Stars whose second moments can be measured one by one, and how many of them it takes.
@@ -442,14 +452,13 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
         variance *= 2.0
     # The square of the window is a narrower window.
     spread = _second_moments(window_moments(stamps, variance, x, y, window / np.sqrt(2.0)))
-    near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
     use = (
         whole
         & (light > 0.0)
         & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0)
         & stamps.good.all((0, 1))
     )
-    use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
+    use[disturbed(fit.x_px, fit.y_px, fit.flux, 4.0 * float(window.max(initial=0.0)))] = False
     gradient = _window_gradient(sums, window, fit, use)
     noise = spread / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
     inverse = np.linalg.inv(gradient)
