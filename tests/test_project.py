@@ -337,7 +337,7 @@ WITHOUT_NAMESAKE = {
     "images": "background detection extract fits fits_files image pixel_phase pixels psf raw",
     "inference": "derived surrogate",
     "likelihood": (
-        "arrays effect_likelihood effect_sums elimination expansion fitted_effects "
+        "arrays effect_likelihood effect_sums elimination expansion "
         "frame_products ipopt loops/common loops/frames loops/unrolled "
         "noise_model paths shapes star_errors zenith"
     ),
