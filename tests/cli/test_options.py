@@ -6,12 +6,14 @@ itself.
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 from pathlib import Path
 
 import pytest
 import typer
+from scipy.optimize import brentq
 
 import starcal_uq as sc
 from starcal_uq.cli import commands as declared
@@ -297,3 +299,18 @@ def test_a_remedy_of_a_run_file_repeats_nothing_that_was_given(monkeypatch, tmp_
 def test_help_lists_the_distortion_models(commands):
     (model,) = (one for one in commands["run"].params if one.name == "model")
     assert f"One of: {', '.join(sc.camera.model_names())}, or one of" in model.help
+
+
+def test_docstrings_of_libraries_are_missing_within_a_command_only(monkeypatch):
+    found = []
+
+    def command():
+        found.extend(map(inspect.getdoc, (brentq, main)))
+        raise SystemExit(2)
+
+    monkeypatch.setattr("starcal_uq.cli.app._main", command)
+    with pytest.raises(SystemExit):
+        main()
+    assert found[0] is None
+    assert found[1].startswith("Run a command")
+    assert "root" in inspect.getdoc(brentq)
