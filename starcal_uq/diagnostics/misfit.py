@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from starcal_uq.core.display import Shown
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import Freed, without_effects
@@ -123,6 +124,7 @@ class Misfit(Shown):
         return pd.DataFrame(rows).rename(columns={"name": "test"})
 
 
+@bounded
 @one_thread()
 def misfit_tests(
     obs: Observations,
@@ -130,7 +132,7 @@ def misfit_tests(
     *,
     max_cells: int = MAX_CELLS,
     most_frames: int | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Misfit:
     """Test the residuals of a calibration for unexplained structure.
 
@@ -158,7 +160,7 @@ def misfit_tests(
     obs = weighed(obs, cal)
     obs, cal = of_heard(obs, cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
-    some, own, of_frames = of_some_frames(obs, cal, most_frames, seed)
+    some, own, of_frames = of_some_frames(obs, cal, most_frames, seed_of(seed))
     places = np.flatnonzero(np.isin(obs.frame, some.frame_ids)) if of_frames else None
     sums, share = ShapeSums(some, own, families, places), some.n_frames / obs.n_frames
     every = sums.for_all(obs, cal) if of_frames else sums

@@ -343,6 +343,7 @@ def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(monkeypatch)
     for n_frames in (40, 160):
         obs = observations(n_frames=n_frames)
         cal = calibrate(obs, nominal(camera()))
+        _ = cal.attitude_noise, cal.compressed  # Made from all frames when they are first read.
         monkeypatch.setattr(MarginalLikelihood, "sums", counted)
         visited.clear()
         sample(obs, cal, **QUICKER, evaluation="compressed")
