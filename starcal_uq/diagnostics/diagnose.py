@@ -56,8 +56,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
-# Frames, where there are more, of which the tests that find all that matters in so many are made;
-# for errors of the stars, whose effect grows beside the noise of more frames.
+# Most frames that tests use whose sample of so many shows all that matters; more for errors of the
+# stars, whose effect grows beside the noise of more frames.
 _FRAMES, _STAR_FRAMES = 10_000, 20_000
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's
 # longer side.
@@ -298,8 +298,8 @@ def diagnose(
     progress : callable, optional
         Called with the number of steps done and their total.
     apart, left_out : callable, optional
-        What waits for `diagnose_apart` and `leave_frames_out` of the same arguments, which run
-        elsewhere; None of it is asked for here again.
+        Calls that wait for `diagnose_apart` and `leave_frames_out` of the same arguments, which run
+        elsewhere; what gives None is computed here.
     """
     seed = seed_of(seed)
     step = progress or (lambda done, total: None)

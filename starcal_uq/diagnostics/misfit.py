@@ -144,8 +144,9 @@ def misfit_tests(
     max_cells : int
         Largest number of field cells along the longer side.
     most_frames : int, optional
-        Frames of which, where there are more, the tests for unequal noise and for frames that differ
-        are made, and the covariance of the shapes in the others; all by default, and beside effects.
+        Most frames that the tests for unequal noise and for frames that differ use, and the
+        covariance of the shapes in the other tests: a sample where there are more. All frames by
+        default, and of a calibration with effects.
     seed : int
         Seed of the choice of these frames.
 

@@ -123,8 +123,9 @@ def of_heard(obs: Observations, cal: Calibration) -> tuple[Observations, Calibra
 def of_some_frames(
     obs: Observations, cal: Calibration, most: int | None, seed: int
 ) -> tuple[Observations, Calibration, int]:
-    """At most so many frames, the estimate from all with their residuals and frames alone, and how
-    many frames all are; all of them, and 0, where there are no more, and beside effects.
+    """A sample of at most so many frames, the calibration with the residuals and frames of the
+    sample alone, and the number of all frames; all frames, and 0, where there are no more or
+    effects are fitted.
     """
     if most is None or obs.n_frames <= most or cal.known_effects.fitted:
         return obs, cal, 0

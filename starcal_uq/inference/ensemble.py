@@ -99,7 +99,7 @@ def run_ensembles(
     import emcee
 
     class Sampler(emcee.EnsembleSampler):  # type: ignore[misc, unused-ignore]
-        """The one of emcee, which reads the density of every walker by itself."""
+        """emcee's sampler with the densities as one array: emcee itself loops over the walkers."""
 
         def compute_log_prob(self, coords: FloatArray) -> tuple[FloatArray, None]:
             found = density(coords)
